@@ -4,7 +4,7 @@ Both balls are seen from afar along the camera's axis, in `SIZE` x `SIZE` pixels
 white and Lambertian: its pixels are the irradiance / pi at each normal that faces the viewer. The glossy one is
 the s of roughness `GLOSSY` (F = 1, a GGX lobe, single scattering); mirror directions of a ball's pixels are spread
 evenly over the sphere, so that it shows light from everywhere. Integrated over 32 x 64 texels, without noise
-(`unirender.surface_light`): within about a hundredth of the mean.
+(`unirender.light.surface_light`): within about a hundredth of the mean.
 
 Such balls are how estimates of light are usually compared, since what matters of a light is what it makes of things
 put into it: a lamp of one texel and one smeared over two are the same to both, and far apart texel by texel.
@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from unirender.surface_light import diffuse_light, lobe_light
+from unirender.light.surface_light import diffuse_light, lobe_light
 from unirender_evaluation import metrics
 from unirender_evaluation.metrics import SCALES, Variant, metric_key
 

@@ -1,7 +1,7 @@
 """How far a found light is from the true one: log-RMSE at the best scale, and the direction that it comes from, for
 both of which the scale is free; `score_light` adds what it makes of two balls (`light_balls`).
 
-Both lights are brought to 16 x 32 texels first (`lighting.resample_environment`, which keeps the energy). Notation: p
+Both lights are brought to 16 x 32 texels first (`resample_environment`, which keeps the energy). Notation: p
 found, t true, w the texels' solid angles, eps = `metrics.LOG_EPSILON`.
 """
 
@@ -15,7 +15,7 @@ from scipy.optimize import minimize_scalar
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import (
+from unirender.light.environment import (
     environment_directions,
     resample_environment,
     sample_environment,

@@ -145,7 +145,7 @@ NOT_IN_OPTIMIZED = (
 PARTS: Mapping[str, Part] = {
     "core": Part(
         {
-            "unirender": ("*.py", "*.npy", "picture_files/*.py"),
+            "unirender": ("*.py", "*.npy", "light/*.py", "picture_files/*.py"),
             "unirender_evaluation": (*ROOMS, QUESTIONS),
             "unirender_reference": LIGHT_READER,
         },

@@ -274,6 +274,7 @@ def _code_hash() -> str:
     digest = hashlib.sha256()
     for package, pattern in (
         ("unirender", "*.py"),
+        ("unirender", "light/*.py"),
         ("unirender", "picture_files/*.py"),
         ("unirender_reference", "**/*"),
     ):

@@ -1,7 +1,7 @@
-"""The gauge applied to a scene: `unirender.exposure` with the target drawn by seed and a d buffer of its own.
+"""The gauge applied to a scene: `unirender.light.exposure` with the target drawn by seed and a d buffer of its own.
 
 The rule itself (a percentile of the white-diffuse luminance is mapped to a target) is shared with the training data's
-augmentation and stands in `unirender.exposure`. It sees the light and the object, never the material.
+augmentation and stands in `unirender.light.exposure`. It sees the light and the object, never the material.
 """
 
 from typing import Any, Protocol, runtime_checkable
@@ -9,8 +9,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from unirender import exposure as gauge
 from unirender.errors import UnirenderError
+from unirender.light import exposure as gauge
 from unirender_reference.faults import LightFault, ObjectFault
 
 PASS_SPP = 16

@@ -21,7 +21,7 @@ from unirender.arguments import as_instance
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import as_light
+from unirender.light.environment import as_light
 from unirender_reference import exposure
 from unirender_reference.backend import mitsuba
 from unirender_reference.geometry import geometry_buffers

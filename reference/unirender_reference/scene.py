@@ -16,7 +16,7 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import as_numbers, as_radiance
-from unirender.lighting import drawable
+from unirender.light.environment import drawable
 from unirender_reference import materials
 from unirender_reference.backend import mitsuba
 from unirender_reference.shapes import MeshObject
@@ -124,7 +124,7 @@ def envmap_data(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h
 
 
 def envmap_rows(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w 3"]:
-    """The environment, checked, as Mitsuba can sample it: itself, or with a row between each two (`lighting.drawable`).
+    """The environment, checked, as Mitsuba can sample it: itself, or with a row between each two (`drawable`).
 
     Raises:
         UnirenderError: it is too small, black, negative, not finite or above `MOST_RADIANCE`.
@@ -134,7 +134,7 @@ def envmap_rows(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h
         # Mitsuba resamples smaller maps when it loads them.
         raise UnirenderError(
             f"environment: got shape {environment.shape}, expected (height >= 3, width >= 2, 3); "
-            "move the channels last, or resample it (unirender.lighting.resample_environment)"
+            "move the channels last, or resample it (unirender.light.environment.resample_environment)"
         )
     if not np.isfinite(environment).all() or environment.min() < 0:
         raise UnirenderError(

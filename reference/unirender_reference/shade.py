@@ -24,7 +24,7 @@ from jaxtyping import Float
 from unirender.arguments import as_instance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics, as_numbers
-from unirender.lighting import as_light
+from unirender.light.environment import as_light
 from unirender_reference.passes import NAN_ATTEMPTS, SAMPLES_PER_PASS, Counters, derive_seed, finite_pass, pass_count
 from unirender_reference.scene import envmap_data
 from unirender_reference.shader import PARAMETERS, Parameter, Shader, gradient, tensors

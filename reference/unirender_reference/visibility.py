@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from unirender.exr import exr_bytes, intrinsics_channels
-from unirender.lighting import environment_directions
+from unirender.light.environment import environment_directions
 from unirender_reference.backend import mitsuba
 from unirender_reference.passes import derive_seed
 from unirender_reference.plan import GroupPlan

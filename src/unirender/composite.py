@@ -27,7 +27,7 @@ from unirender.arguments import as_instance
 from unirender.blocks import by_rows
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics, unit_normals
-from unirender.surface_light import MIN_ALPHA
+from unirender.light.surface_light import MIN_ALPHA
 from unirender.vectors import dots
 
 DIELECTRIC_F0 = 0.04  # reflectance at normal incidence of the principled BSDF's default ior, 1.5
@@ -184,6 +184,6 @@ def _maps(intrinsics: Intrinsics, *names: str) -> dict[str, np.ndarray]:
     if missing:
         raise UnirenderError(
             f"composite: maps {', '.join(missing)} are missing, expected {', '.join(names[:-1])} and {names[-1]}; "
-            "derive specular and diffuse from an environment with unirender.surface_light"
+            "derive specular and diffuse from an environment with unirender.light.surface_light"
         )
     return maps

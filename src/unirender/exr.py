@@ -3,7 +3,7 @@
 Channel names: `R,G,B[,A]` (the image, premultiplied), `albedo.R/G/B`, `normal.X/Y/Z`, `roughness.Y`, `metallic.Y`,
 `specular.R/G/B`, `diffuse.R/G/B`; the mask is `A`, or `mask.Y` where there is no image. Half precision by default; an
 environment is a file of its own in float32, since the sun overflows half, and says that it stands on the grid of
-`unirender.lighting`: most lat-long maps do not. Provenance stands in string attributes `unirender:*`. Equal content
+`light.environment`: most lat-long maps do not. Provenance stands in string attributes `unirender:*`. Equal content
 gives equal bytes.
 """
 
@@ -65,7 +65,7 @@ def write_exr(
 def write_environment(
     path: str | Path, environment: Float[np.ndarray, "h w 3"], attributes: Mapping[str, str] | None = None
 ) -> None:
-    """Writes an environment of the contract (rows on the poles, `unirender.lighting`) in float32, marked as one.
+    """Writes an environment of the contract (rows on the poles, `light.environment`) in float32, marked as one.
 
     `on_pole_grid` knows it again. Arguments and errors as `write_exr`.
     """

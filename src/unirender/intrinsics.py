@@ -54,7 +54,7 @@ class Intrinsics:
         specular: s, radiance of the same surface as a perfect mirror-tinted reflector of the same roughness under the
             same light, direct light only; linear HDR, >= 0.
         diffuse: d, radiance of the same surface as white Lambertian (irradiance / pi), direct light only; >= 0.
-        environment: the light, lat-long HDR radiance in camera axes, own resolution; >= 0. See `unirender.lighting`.
+        environment: the light, lat-long HDR radiance in camera axes, own resolution; >= 0. See `light.environment`.
         mask: coverage, [0, 1].
         camera: vertical field of view and principal point.
     """

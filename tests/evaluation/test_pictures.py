@@ -7,7 +7,7 @@ import pytest
 from tiny_suites import make_suite
 
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import environment_directions
+from unirender.light.environment import environment_directions
 from unirender_evaluation.engine import Prediction
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.records import Record

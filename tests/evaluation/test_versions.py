@@ -61,7 +61,7 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("part", "package", "files"),
     [
-        ("core", "unirender", ("composite.py", "environment_brdf.npy", "lighting.py", "symmetries.py")),
+        ("core", "unirender", ("composite.py", "environment_brdf.npy", "light/environment.py", "picture_files/icc.py")),
         ("core", "unirender_evaluation", ("scoring.py", "metrics.py", "ssim.py", "tasks.py", "tables/specs.py")),
         (MODEL, "unirender", ("models/dual_stream.py", "pipelines/editing.py", "diffusion/inference.py")),
         (REFERENCE, "unirender_reference", ("shade.py", "shapes/parametric.py", "lights/bundled.py")),

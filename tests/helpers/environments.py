@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from unirender.lighting import environment_directions
+from unirender.light.environment import environment_directions
 
 
 def smooth_environment(height: int = 32, width: int = 64) -> np.ndarray:

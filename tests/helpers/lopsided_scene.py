@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from unirender.lighting import environment_directions
+from unirender.light.environment import environment_directions
 from unirender_reference.shapes import MeshObject
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from unirender.composite import composite
 from unirender.exr import exr_bytes, image_channels, intrinsics_channels
 from unirender.intrinsics import Intrinsics
-from unirender.surface_light import diffuse_light, specular_light
+from unirender.light.surface_light import diffuse_light, specular_light
 
 
 def sphere(size: int, rng: np.random.Generator) -> Intrinsics:

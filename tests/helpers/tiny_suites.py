@@ -11,7 +11,7 @@ import numpy as np
 from unirender.camera import Camera
 from unirender.composite import composite
 from unirender.exr import exr_bytes, image_channels
-from unirender.surface_light import diffuse_light, specular_light
+from unirender.light.surface_light import diffuse_light, specular_light
 from unirender_evaluation.suites.spec import read_spec
 from unirender_evaluation.suites.suite import Scene, Suite, SuiteSpec, load_suite
 from unirender_evaluation.suites.truth_file import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from lopsided_scene import ALBEDO, KEY, RIM, light, lopsided_object
 
-from unirender.symmetries import Maps, mirror, permute_channels, quarter_turn, turn_rotation
+from unirender.light.symmetries import Maps, mirror, permute_channels, quarter_turn, turn_rotation
 from unirender.training.augmentations.augment import METALLIC_NODES, interpolate_metallic, mix_lights
 from unirender_reference.passes import Estimate
 from unirender_reference.render import Renderer

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from unirender.exposure import exposure_factor
 from unirender.exr import channels_rgb, read_exr_bytes
-from unirender.symmetries import mirror, permute_channels, quarter_turn, turn_rotation
+from unirender.light.exposure import exposure_factor
+from unirender.light.symmetries import mirror, permute_channels, quarter_turn, turn_rotation
 from unirender.training.augmentations.augment import Draw, mix_lights
 from unirender.training.data.dataset import GroupDataset
 from unirender_reference.dataset import render_group

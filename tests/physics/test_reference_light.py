@@ -10,8 +10,8 @@ import reference_scenes as scenes
 
 from unirender.camera import Camera
 from unirender.exr import image_channels, write_exr
-from unirender.lighting import mirror_environment, sample_environment
-from unirender.surface_light import diffuse_light, specular_light
+from unirender.light.environment import mirror_environment, sample_environment
+from unirender.light.surface_light import diffuse_light, specular_light
 from unirender_reference import backend
 from unirender_reference.render import Renderer, SceneSpec, render_sample
 from unirender_reference.scene import load_scene, sensor_dict
@@ -96,7 +96,7 @@ def test_camera_sees_the_environment_along_its_rays() -> None:
 
 
 def test_convex_object_sees_the_closed_form_light(ball: Renderer) -> None:
-    """Without shadows d and s are `unirender.lighting`'s integrals; a light turned by one column is not."""
+    """Without shadows d and s are `unirender.light.environment`'s integrals; a light turned by one column is not."""
     light = scenes.environment(5, (12, 24), peaks=1)
     geometry = ball.geometry(64)
     normal = geometry.require("normal")["normal"]

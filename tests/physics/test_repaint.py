@@ -7,7 +7,7 @@ from lopsided_scene import ALBEDO, KEY, lopsided_object
 from unirender.color import image_srgb
 from unirender.composite import split_sum_image
 from unirender.intrinsics import Intrinsics
-from unirender.symmetries import Maps
+from unirender.light.symmetries import Maps
 from unirender.training.augmentations.repaint import CHANNEL_RANGE, mean_colour, recoloured, repaint
 from unirender_reference.render import Renderer
 

@@ -8,7 +8,7 @@ from environments import smooth_environment
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import rotate_environment
+from unirender.light.environment import rotate_environment
 from unirender.scene_export import export_scene
 from unirender_reference.backend import mitsuba
 from unirender_reference.shade import shade

@@ -223,7 +223,7 @@ def test_every_file_says_how_it_was_made(whole: Path) -> None:
 
 def test_exposure_maps_the_bright_end_of_d_into_the_stated_range(whole: Path) -> None:
     from unirender.color import luminance
-    from unirender.exposure import TARGET_RANGE
+    from unirender.light.exposure import TARGET_RANGE
 
     for sample in read_back(whole):
         mask = read_exr_bytes(sample["shared.exr"])[0]["mask.Y"]

@@ -15,8 +15,8 @@ from unirender.errors import UnirenderError
 from unirender.exr import image_channels, on_pole_grid, read_exr, write_environment, write_exr
 from unirender.files import new_folder, write_result
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import resample_environment
-from unirender.surface_light import diffuse_light, specular_light
+from unirender.light.environment import resample_environment
+from unirender.light.surface_light import diffuse_light, specular_light
 from unirender_reference.dataset import render_group
 from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.lights import load_light

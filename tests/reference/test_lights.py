@@ -12,7 +12,7 @@ from PIL import Image
 from unirender.color import luminance
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
-from unirender.lighting import environment_directions, mean_radiance, sample_environment, texel_solid_angles
+from unirender.light.environment import environment_directions, mean_radiance, sample_environment, texel_solid_angles
 from unirender_reference import lights
 from unirender_reference.lights import files
 from unirender_reference.lights.convert import PACKAGES, convert

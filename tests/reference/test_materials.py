@@ -11,8 +11,8 @@ from scipy import ndimage
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import environment_directions
-from unirender.surface_light import diffuse_light
+from unirender.light.environment import environment_directions
+from unirender.light.surface_light import diffuse_light
 from unirender_reference import effects, materials
 from unirender_reference.backend import mitsuba
 from unirender_reference.integrators import python_integrator

@@ -12,7 +12,7 @@ from occluders import book, torus
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import environment_directions
+from unirender.light.environment import environment_directions
 from unirender_reference import principled
 from unirender_reference.backend import mitsuba
 from unirender_reference.passes import Counters, Estimate, mean_estimate

@@ -12,7 +12,7 @@ from occluders import book
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import sample_environment
+from unirender.light.environment import sample_environment
 from unirender_reference import principled
 from unirender_reference import shade as shading
 from unirender_reference import shader as shader_module

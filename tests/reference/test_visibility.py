@@ -9,7 +9,7 @@ import pytest
 import webdataset
 
 from unirender.errors import UnirenderError
-from unirender.lighting import environment_directions
+from unirender.light.environment import environment_directions
 from unirender_reference.commands import Dataset
 from unirender_reference.dataset import generate
 from unirender_reference.dataset_config import DatasetConfig

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from synthetic_shards import sphere
 
-from unirender.lighting import environment_directions
-from unirender.surface_light import diffuse_light
+from unirender.light.environment import environment_directions
+from unirender.light.surface_light import diffuse_light
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from unirender.errors import UnirenderError
-from unirender.symmetries import permute_channels, scale_light
+from unirender.light.symmetries import permute_channels, scale_light
 from unirender.training.augmentations.augment import from_maps, interpolate_metallic, mix_lights, to_maps
 
 

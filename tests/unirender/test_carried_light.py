@@ -9,7 +9,7 @@ from seen_shapes import as_maps, gutter
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import environment_directions
+from unirender.light.environment import environment_directions
 from unirender.pipelines import carried_light
 from unirender.pipelines.carried_light import MOST_RATIO, _smoothed, agreement, with_carried_light
 from unirender.pipelines.derived_light import derived_light

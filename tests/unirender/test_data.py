@@ -16,11 +16,11 @@ from webdataset.compat import WebDataset
 
 from unirender.composite import composite_image
 from unirender.errors import UnirenderError
-from unirender.exposure import PERCENTILE, TARGET_RANGE, exposure_factor
-from unirender.lighting import mean_radiance, resample_environment, rotate_environment
+from unirender.light.environment import mean_radiance, resample_environment, rotate_environment
+from unirender.light.exposure import PERCENTILE, TARGET_RANGE, exposure_factor
+from unirender.light.surface_light import diffuse_light, specular_light
+from unirender.light.symmetries import turn_rotation
 from unirender.paths import cache_dir
-from unirender.surface_light import diffuse_light, specular_light
-from unirender.symmetries import turn_rotation
 from unirender.training.augmentations.augment import (
     DEFAULT_AUGMENTATION,
     NO_AUGMENTATION,

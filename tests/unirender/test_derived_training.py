@@ -19,13 +19,13 @@ from unirender.diffusion.timesteps import Timesteps
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, exr_bytes, intrinsics_channels, read_exr_bytes
 from unirender.intrinsics import Intrinsics
+from unirender.light.surface_light import diffuse_light, specular_light
 from unirender.models.conditioning import DERIVED_FLAG
 from unirender.models.packing import TRIPLETS
 from unirender.pipelines.editing import under_light
 from unirender.pipelines.inputs import ready_to_render, told_derived
 from unirender.pipelines.results import EditResult
 from unirender.pipelines.shadowed_light import visible_shares
-from unirender.surface_light import diffuse_light, specular_light
 from unirender.training.augmentations.augment import NO_AUGMENTATION
 from unirender.training.config import Augmentation, LossConfig
 from unirender.training.data import derived

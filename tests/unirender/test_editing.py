@@ -6,7 +6,7 @@ from scipy.ndimage import gaussian_filter
 from synthetic_shards import sphere
 
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import environment_directions
+from unirender.light.environment import environment_directions
 from unirender.pipelines.derived_light import derived_specular
 from unirender.pipelines.editing import (
     ANCHOR_FLOOR,

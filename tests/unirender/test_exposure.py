@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from unirender.errors import UnirenderError
-from unirender.exposure import TARGET_RANGE, draw_target, exposure_factor
+from unirender.light.exposure import TARGET_RANGE, draw_target, exposure_factor
 from unirender.pipelines.editing import RELIGHT_TARGET
 
 

@@ -12,7 +12,7 @@ from tiny_models import make_pipeline
 from unirender import blocks
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import mean_radiance
+from unirender.light.environment import mean_radiance
 from unirender.pipelines.framing import FAINT, Frame, resize, visible_parts
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from environments import random_directions
 
-from unirender.ggx import dot, facing_normal, halton, mirror_direction, smith_g1, tangents, visible_normals
+from unirender.light.ggx import dot, facing_normal, halton, mirror_direction, smith_g1, tangents, visible_normals
 
 
 def directions(count: int) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from environments import random_directions, smooth_environment
 
-from unirender.lighting import (
+from unirender.light.environment import (
     area_pixels,
     environment_directions,
     mean_radiance,

@@ -9,7 +9,8 @@ import pytest
 from unirender.camera import Camera
 from unirender.composite import split_sum_image
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import environment_directions
+from unirender.light.environment import environment_directions
+from unirender.light.surface_light import diffuse_light, specular_light
 from unirender.pipelines import derived_light
 from unirender.pipelines.derived_light import COARSE_ROWS, LIGHT_SIDE, derived_diffuse, derived_specular
 from unirender.pipelines.editing import specular_for_roughness, specular_share, trust, under_light
@@ -17,7 +18,6 @@ from unirender.pipelines.framing import Frame
 from unirender.pipelines.inputs import ready_to_render
 from unirender.pipelines.revealed_light import agreeing_light
 from unirender.pipelines.shadowed_light import visible_shares
-from unirender.surface_light import diffuse_light, specular_light
 
 CAMERA = Camera(fov_deg=50.0, principal=(0.35, 0.6))
 TOLERANCE = 0.03  # of the light's mean

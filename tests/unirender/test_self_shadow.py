@@ -8,10 +8,12 @@ import torch
 from seen_shapes import CAMERA, SIZE, as_maps, ball, gutter, rays
 
 from unirender.camera import Camera
-from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import environment_directions, texel_solid_angles
-from unirender.lobes import texel_directions, texels
+from unirender.light.environment import environment_directions, texel_solid_angles
+from unirender.light.exposure import exposure_factor
+from unirender.light.lobes import texel_directions, texels
+from unirender.light.surface_light import QUADRATURE_SHAPE
+from unirender.light.symmetries import mirror, quarter_turn
 from unirender.pipelines.derived_light import derived_diffuse, derived_light, derived_specular
 from unirender.pipelines.editing import RELIGHT_TARGET, under_light
 from unirender.pipelines.normal_integration import RIGHT, TETHER, _neighbours, _system, integrate_normals
@@ -26,8 +28,6 @@ from unirender.pipelines.shadowed_light import (
     visible_shares,
     visible_shares_under,
 )
-from unirender.surface_light import QUADRATURE_SHAPE
-from unirender.symmetries import mirror, quarter_turn
 
 
 def sky(rows: int = 16) -> np.ndarray:

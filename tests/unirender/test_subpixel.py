@@ -3,10 +3,10 @@
 import numpy as np
 from environments import random_directions, smooth_environment
 
-from unirender.ggx import halton
-from unirender.lighting import sample_environment
-from unirender.lobes import MipPyramid
-from unirender.subpixel import MEAN_WEIGHTS, Surroundings, inside
+from unirender.light.environment import sample_environment
+from unirender.light.ggx import halton
+from unirender.light.lobes import MipPyramid
+from unirender.light.subpixel import MEAN_WEIGHTS, Surroundings, inside
 
 EVERY = slice(None)
 

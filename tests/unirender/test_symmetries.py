@@ -7,8 +7,8 @@ import pytest
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.surface_light import diffuse_light
-from unirender.symmetries import LIGHT_MAPS, mirror, quarter_turn, scale_light, turn_rotation
+from unirender.light.surface_light import diffuse_light
+from unirender.light.symmetries import LIGHT_MAPS, mirror, quarter_turn, scale_light, turn_rotation
 
 
 def equal(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:

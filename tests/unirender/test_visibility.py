@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from seen_shapes import CAMERA, as_maps, ball, gutter
 
-from unirender.lobes import texel_directions
+from unirender.light.lobes import texel_directions
 from unirender.models.visibility import (
     AZIMUTHS,
     BANDS,

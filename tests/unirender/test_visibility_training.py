@@ -21,7 +21,7 @@ from unirender.command_line.process_ends import SIGNALS
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import exr_bytes, intrinsics_channels
 from unirender.intrinsics import Intrinsics
-from unirender.lobes import texel_directions
+from unirender.light.lobes import texel_directions
 from unirender.models.visibility import CLASSES, VisibilityNet, bin_weights
 from unirender.training.loop import checkpoint
 from unirender.training.loop.checkpoint import load_state

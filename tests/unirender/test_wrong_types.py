@@ -17,16 +17,16 @@ from diffusers.utils import logging
 from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode, unpremultiply
 from unirender.composite import composite_image
-from unirender.exposure import exposure_factor
+from unirender.light.exposure import exposure_factor
 from unirender.exr import read_exr, write_exr
 from unirender.files import map_picture, read_result, write_png, write_result
 from unirender.intrinsics import Intrinsics
 from unirender.pictures import read_picture
 from PIL import Image
-from unirender.lighting import resample_environment, rotate_environment, sample_environment
+from unirender.light.environment import resample_environment, rotate_environment, sample_environment
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.scene_export import export_scene
-from unirender.surface_light import diffuse_light, specular_light
+from unirender.light.surface_light import diffuse_light, specular_light
 from unirender_evaluation import read_results, score
 from unirender_evaluation.scoring import score_maps
 from unirender_evaluation.suites.suite import load_suite

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from unirender.color import srgb_decode
 from unirender.command_line.commands import MUCH_COARSE
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import rotate_environment
+from unirender.light.environment import rotate_environment
 from unirender.pictures import Picture
 from unirender.pipelines.carried_light import with_carried_light
 from unirender.pipelines.editing import anchor, specular_for_roughness, too_coarse, under_light

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from unirender.camera import DEFAULT_FILL, Camera
 from unirender.color import image_srgb
-from unirender.lighting import environment_directions
+from unirender.light.environment import environment_directions
 from unirender.visualization import map_picture
 from unirender_evaluation.figures.grid import over_white
 from unirender_evaluation.suites.suite import Scene, Suite

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.composite import composite_image, split_sum_image
 from unirender.intrinsics import Intrinsics
-from unirender.surface_light import diffuse_light, specular_light
+from unirender.light.surface_light import diffuse_light, specular_light
 from unirender_evaluation.methods.method import Image, Mask, seen_linear, uniform_map
 
 

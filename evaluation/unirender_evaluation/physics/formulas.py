@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.intrinsics import Intrinsics
-from unirender.symmetries import mirror, quarter_turn, scale_light
+from unirender.light.symmetries import mirror, quarter_turn, scale_light
 from unirender_evaluation.methods.composite import Composite
 from unirender_evaluation.methods.method import Image, Mask
 from unirender_evaluation.metrics import weighted_mean
@@ -29,7 +29,7 @@ def inside(render: Render) -> Render:
 
 
 def changed(maps: Intrinsics, change: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]) -> Intrinsics:
-    """The scene after a change of `unirender.symmetries`, in arrays of its own."""
+    """The scene after a change of `unirender.light.symmetries`, in arrays of its own."""
     return maps.replace(**{name: np.ascontiguousarray(value) for name, value in change(maps.maps).items()})
 
 

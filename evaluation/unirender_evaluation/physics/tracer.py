@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.symmetries import mirror, quarter_turn, turn_rotation
+from unirender.light.symmetries import mirror, quarter_turn, turn_rotation
 from unirender_evaluation.methods.method import Image
 from unirender_evaluation.physics.formulas import changed
 from unirender_evaluation.physics.stage import Stage

@@ -19,7 +19,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from unirender.color import eight_bits, image_srgb
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import sample_environment
+from unirender.light.environment import sample_environment
 from unirender.whole_files import replace_file
 from unirender_evaluation.engine import Prediction
 from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL, ball_mask, ball_normals, balls

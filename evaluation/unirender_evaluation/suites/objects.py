@@ -96,7 +96,7 @@ def missing_folder(spec: SuiteSpec, kind: Literal["objects", "lights"]) -> str:
 
 def broken_meshes(sources: Sequence[ObjectSource], spec: SuiteSpec) -> Iterator[str]:
     """Reads every mesh once and looks whether the suite's camera sees it: the reasons of those that cannot be used."""
-    from unirender.exposure import MASK_THRESHOLD
+    from unirender.light.exposure import MASK_THRESHOLD
     from unirender_reference.render import Renderer
 
     for source in sources:

@@ -34,7 +34,7 @@ from unirender_evaluation.truth.sources import check_files
 from unirender_reference.processes import start_worker
 
 CODE = {  # what a rendered part depends on
-    "unirender": ("camera.py", "color.py", "exposure.py", "exr.py", "intrinsics.py", "lighting.py"),
+    "unirender": ("camera.py", "color.py", "exr.py", "intrinsics.py", "light/environment.py", "light/exposure.py"),
     "unirender_reference": ("**/*.py",),
     "unirender_evaluation": (
         *("truth/object.py", "truth/render.py", "suites/truth_file.py", "methods/ceiling.py"),

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.camera import Camera
-from unirender.lighting import sample_environment
+from unirender.light.environment import sample_environment
 from unirender_reference import materials, scene
 from unirender_reference.backend import mitsuba
 from unirender_reference.checks.ball import ALBEDO, ball, ball_view

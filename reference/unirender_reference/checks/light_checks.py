@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.camera import Camera
-from unirender.lighting import environment_directions, sample_environment
-from unirender.surface_light import diffuse_light
+from unirender.light.environment import environment_directions, sample_environment
+from unirender.light.surface_light import diffuse_light
 from unirender_reference.checks.ball import ALBEDO, ball, ball_view
 from unirender_reference.checks.outcome import BATCHES, Check, against_truth
 from unirender_reference.passes import derive_seed
@@ -42,12 +42,12 @@ def orientation(seed: int) -> Check:
 
 
 def diffuse_buffer(seed: int) -> Check:
-    """d of the convex sphere is irradiance / pi, as `unirender.surface_light` has it."""
+    """d of the convex sphere is irradiance / pi, as `unirender.light.surface_light` has it."""
     view, light = ball_view(Camera(), SIZE, FINE), _lobes(seed)
     closed = diffuse_light(view.normal[None].astype(np.float32), light)[0]
     own = derive_seed(seed, "diffuse-buffer")
     estimate = Renderer(ball(), resolution=SIZE).diffuse(light, 4 * SPP, own, BATCHES)
-    note = "d = irradiance / pi of unirender.surface_light"
+    note = "d = irradiance / pi of unirender.light.surface_light"
     return against_truth("diffuse-buffer", [estimate], [view.pixel_mean(closed)], view.full, note, 3e-3)
 
 

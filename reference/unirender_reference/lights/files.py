@@ -30,7 +30,7 @@ from unirender.blocks import by_rows
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, image_channels, on_pole_grid, pixel_count, read_exr
-from unirender.lighting import check_shape, resample_environment
+from unirender.light.environment import check_shape, resample_environment
 from unirender.machine import memory_excess
 from unirender.picture_files import display_files
 from unirender.picture_files.primaries import REC709, in_rec709

@@ -1,6 +1,6 @@
 """`Light`: a distant light as a lat-long map, and the two things every light goes through.
 
-Maps are linear Rec.709 radiance in camera axes, +y up, on the grid of `unirender.lighting` (rows at theta =
+Maps are linear Rec.709 radiance in camera axes, +y up, on the grid of `unirender.light.environment` (rows at theta =
 pi i / (H - 1), columns at centres; the middle of the map is +z, behind the camera). A light has no exposure of its own:
 its luminance, averaged over the sphere by solid angle, is 1 (but for files loaded with `normalise=False`).
 """
@@ -15,7 +15,7 @@ from jaxtyping import Float
 from unirender.color import luminance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import check_radiance
-from unirender.lighting import check_shape, hat_weights, mean_radiance, weighted_means
+from unirender.light.environment import check_shape, hat_weights, mean_radiance, weighted_means
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender.lighting import mirror_environment, rotate_environment
+from unirender.light.environment import mirror_environment, rotate_environment
 
 TILTED = 0.15  # share of the maps that are tilted
 MOST_TILT_DEG = 20.0

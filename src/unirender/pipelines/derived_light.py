@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from unirender.intrinsics import Intrinsics
+from unirender.light.surface_light import diffuse_light, specular_light
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.masked_maps import unit_normal
 from unirender.pipelines.shadowed_light import visible_shares
-from unirender.surface_light import diffuse_light, specular_light
 from unirender.vectors import lengths, nonzero
 
 LIGHT_SIDE = 256  # pixels along the longer side up to which every pixel is lit by itself

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float
 from unirender.blocks import by_rows
 from unirender.composite import composite_image
 from unirender.errors import UnirenderError
-from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
-from unirender.lobes import LOBE_WIDTH
+from unirender.light.exposure import exposure_factor
+from unirender.light.lobes import LOBE_WIDTH
 from unirender.pipelines.derived_light import derived_light, derived_specular
 from unirender.pipelines.revealed_light import revealed_light
 

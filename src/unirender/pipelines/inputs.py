@@ -12,7 +12,7 @@ from PIL import Image
 from unirender.arguments import as_instance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import RANGE_TOLERANCE, Intrinsics, as_numbers
-from unirender.lighting import as_light
+from unirender.light.environment import as_light
 from unirender.picture_files.display_files import display_colors, display_values, is_turned
 from unirender.pictures import coverage
 from unirender.pipelines.bounced_light import WHITE_SKY, bounced_light
@@ -103,7 +103,7 @@ def as_mask(mask: Any, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
     if mask.shape != (*size, 1):
         raise UnirenderError(f"mask: got shape {mask.shape}, expected {(*size, 1)}, the size of the picture")
     mask = np.array(_checked("mask", mask, "divide an 8-bit mask by 255"))  # results keep it, and may not share it
-    if not (mask > 0.5).any():  # as `unirender.exposure` asks
+    if not (mask > 0.5).any():  # as `unirender.light.exposure` asks
         raise UnirenderError(
             f"mask: no pixel is covered by more than one half, the most by {mask.max():.3g}, expected an object in view"
         )
@@ -114,7 +114,7 @@ def as_environment(environment: Any) -> Float[np.ndarray, "eh ew 3"]:
     """Radiance of a lat-long map.
 
     Raises:
-        UnirenderError: as `unirender.lighting.as_light`; or it is the path of a file, or black.
+        UnirenderError: as `unirender.light.environment.as_light`; or it is the path of a file, or black.
     """
     if isinstance(environment, str | Path):
         raise UnirenderError(

@@ -1,7 +1,7 @@
 """Several looks at one picture, and their mean: test-time augmentation.
 
 A mirrored picture is a picture of the mirrored object, and one whose colour channels are exchanged is of an object of
-other colours (`unirender.symmetries`). A network that learned from a few thousand objects agrees with itself on this
+other colours (`light.symmetries`). A network that learned from a few thousand objects agrees with itself on this
 only nearly, and the mean of what it says is better than what it says once. No look is resampled: no detail is lost.
 
 Which colours an object may have is something a network knows, and exchanged channels take that away: colours, normals
@@ -18,8 +18,8 @@ import torch
 from unirender.camera import Camera
 from unirender.diffusion.sampling import is_whole
 from unirender.errors import UnirenderError
+from unirender.light.symmetries import Maps, mirror, permute_channels
 from unirender.models.packing import Packing
-from unirender.symmetries import Maps, mirror, permute_channels
 
 MATERIAL = ("roughness", "metallic")
 AS_IT_IS = (0, 1, 2)

@@ -15,16 +15,16 @@ wrong about.
 an edit takes the s of another roughness from it, for which d says nothing (docs/training_record.md).
 
 Notation: L the light's texels; W, C what the lobe and the cosine of each pixel take of each texel
-(`unirender.lobes.lobe_matrix`, `cosine_matrix`); c how much d counts beside s.
+(`unirender.light.lobes.lobe_matrix`, `cosine_matrix`); c how much d counts beside s.
 """
 
 import numpy as np
 from jaxtyping import Float
 
-from unirender.ggx import facing_normal
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import resample_environment
-from unirender.lobes import LOBE_WIDTH, cosine_matrix, lobe_matrix
+from unirender.light.environment import resample_environment
+from unirender.light.ggx import facing_normal
+from unirender.light.lobes import LOBE_WIDTH, cosine_matrix, lobe_matrix
 from unirender.pipelines.framing import Frame
 from unirender.vectors import nonzero
 

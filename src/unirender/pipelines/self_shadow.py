@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int, Integer, Shaped, UInt8, UInt64
 from scipy.ndimage import distance_transform_edt
 
 from unirender.camera import Camera
-from unirender.ggx import dot
+from unirender.light.ggx import dot
 from unirender.pipelines.normal_integration import integrate_normals
 from unirender.vectors import nonzero
 

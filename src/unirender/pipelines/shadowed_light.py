@@ -2,7 +2,7 @@
 
     d = d_0 (integral of V L n.l) / (integral of L n.l),    s = s_0 (integral of V L D n.l) / (integral of L D n.l)
 
-Notation: d_0, s_0 without shadows (`unirender.surface_light`); L the light; V how likely a direction is free, by what
+Notation: d_0, s_0 without shadows (`light.surface_light`); L the light; V how likely a direction is free, by what
 masks say of it and what a network has learned of them (`unirender.models.visibility`); D the GGX distribution at the
 half vector, of a roughness of `LEAST_ROUGHNESS` or more. Up to `SHADOW_SIDE` pixels d is linear in the light; s is only
 as far as a lobe has one light.
@@ -15,12 +15,12 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_edt
 
 from unirender.intrinsics import Intrinsics
-from unirender.lobes import texel_directions, texels
+from unirender.light.lobes import texel_directions, texels
+from unirender.light.surface_light import QUADRATURE_SHAPE
 from unirender.models.visibility import BINS, bin_weights, direction_bins, hidden_chance
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.remembered import MapsKey, remembered
 from unirender.pipelines.self_shadow import SelfShadow, of_rows
-from unirender.surface_light import QUADRATURE_SHAPE
 
 SHADOW_SIDE = 128  # pixels along the longer side at which shadows of larger pictures are found
 KEPT = 2  # pictures; what is hidden in one takes tens of megabytes and seconds

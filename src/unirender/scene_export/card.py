@@ -28,7 +28,7 @@ class Card:
         roughness: perceptual, [0, 1].
         metallic: [0, 1].
         opacity: the mask, 0 where no normal is known.
-        environment: the light, camera axes, on the grid of `unirender.lighting`.
+        environment: the light, camera axes, on the grid of `unirender.light.environment`.
         camera: through which the card fills the frame.
     """
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.exr import image_channels, write_environment, write_exr
-from unirender.lighting import area_pixels, drawable
+from unirender.light.environment import area_pixels, drawable
 from unirender.scene_export.card import Card
 from unirender.visualization import write_png
 

@@ -9,8 +9,8 @@ from tiny_suites import make_suite
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender.surface_light import diffuse_light
-from unirender.symmetries import quarter_turn
+from unirender.light.surface_light import diffuse_light
+from unirender.light.symmetries import quarter_turn
 from unirender_evaluation.methods.composite import Composite
 from unirender_evaluation.methods.method import Image
 from unirender_evaluation.metrics import DEFAULT_VARIANT

@@ -10,7 +10,7 @@ from tiny_models import make_pipeline
 from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
-from unirender.symmetries import turn_rotation
+from unirender.light.symmetries import turn_rotation
 from unirender_evaluation.methods.composite import Composite
 from unirender_evaluation.physics import formulas
 from unirender_evaluation.physics import run as physics_run

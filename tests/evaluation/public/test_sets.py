@@ -16,7 +16,7 @@ from unirender.color import srgb_decode, srgb_encode
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import environment_directions, sample_environment
+from unirender.light.environment import environment_directions, sample_environment
 from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.public.iiw import Iiw
 from unirender_evaluation.public.maw import Maw, adobe_to_rec709, measured

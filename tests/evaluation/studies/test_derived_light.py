@@ -9,7 +9,7 @@ from environments import smooth_environment
 from rich.console import Console
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.surface_light import specular_light
+from unirender.light.surface_light import specular_light
 from unirender_evaluation.records import Record
 from unirender_evaluation.studies.derived_light.command import BenchDerivedLight
 from unirender_evaluation.studies.derived_light.measure import (

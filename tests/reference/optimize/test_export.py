@@ -13,7 +13,7 @@ from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
-from unirender.lighting import area_pixels, environment_directions, middle_rows, sample_environment
+from unirender.light.environment import area_pixels, environment_directions, middle_rows, sample_environment
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights import load_light
 from unirender_reference.meshes import load_mesh, load_mesh_placed

@@ -13,7 +13,7 @@ from reference_scenes import sphere
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import rotate_environment
+from unirender.light.environment import rotate_environment
 from unirender_reference.multiview import orbit, pose_towards
 from unirender_reference.optimize.files.transforms import Y_UP, Up
 from unirender_reference.optimize.multiview.warm import solution_from_predictions

@@ -12,7 +12,7 @@ from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode, unpremultiply
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import MAPS, Intrinsics
-from unirender.lighting import resample_environment
+from unirender.light.environment import resample_environment
 from unirender_reference.optimize.single.config import COLD, Priors, SingleConfig, Trust
 from unirender_reference.optimize.single.fit import Fit, Unknowns
 from unirender_reference.optimize.single.pixels import make_picture

@@ -4,7 +4,7 @@ The truth is the unshadowed pass of the mirror-tinted reflector (s) and of the w
 noise floor is sure to be above `FLOOR_DB`. What is derived from sees the same light, the coverage-weighted mean normal
 of each pixel, and the roughness:
 
-    full          `unirender.surface_light`, the light at its own resolution
+    full          `unirender.light.surface_light`, the light at its own resolution
     small light   the same, the light reduced to 16 x 32 first, as the network has it
     prefiltered   s by the lookup that is usual in real time: the lobe seen head-on about the mirror direction
                   (N = V = R), times the lobe's albedo from where it is really seen
@@ -24,10 +24,10 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError
-from unirender.ggx import facing_normal
 from unirender.intrinsics import Intrinsics
-from unirender.lighting import resample_environment
-from unirender.surface_light import diffuse_light, lobe_light, specular_light
+from unirender.light.environment import resample_environment
+from unirender.light.ggx import facing_normal
+from unirender.light.surface_light import diffuse_light, lobe_light, specular_light
 from unirender_evaluation.metrics import metric_key, psnr
 from unirender_evaluation.records import Record
 from unirender_evaluation.store import KEY_PREFIX, Store

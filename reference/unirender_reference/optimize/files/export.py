@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.exr import channels_rgb, image_channels, read_exr, write_environment, write_exr
-from unirender.lighting import area_pixels, drawable
+from unirender.light.environment import area_pixels, drawable
 from unirender_reference.optimize.files.glb import glb_bytes, png_bytes, texture_pixels
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.shapes import MeshObject, Sphere

@@ -4,7 +4,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float
 
-from unirender.lighting import hat_weights
+from unirender.light.environment import hat_weights
 
 
 def texel_weights(uv: Float[np.ndarray, "n 2"], size: int) -> sp.csr_matrix:

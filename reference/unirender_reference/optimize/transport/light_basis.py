@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from unirender.lighting import hat_weights
+from unirender.light.environment import hat_weights
 from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.transport.light_grid import LightGrid
 
@@ -60,7 +60,7 @@ class Cells:
 
 
 class Texels:
-    """Radiance bilinear between the texels of a grid, as `unirender.lighting` has them; methods as those of `Cells`.
+    """Radiance bilinear between the texels of a grid, as `light.environment` has them; methods as those of `Cells`.
 
     Attributes:
         count: cells that cover the sphere: `FINE`, finer than the grid.

@@ -2,7 +2,7 @@
 
 Light is additive (`mix_lights`), radiance is a quadratic in metallic at depth 4 (`interpolate_metallic`), and the
 renderer treats the colour channels, mirror images and turns about the view axis alike (`permute_channels`, `mirror` and
-`quarter_turn` of `unirender.symmetries`, where `Maps` is explained). tests/physics/test_augmentation.py holds each
+`quarter_turn` of `light.symmetries`, where `Maps` is explained). tests/physics/test_augmentation.py holds each
 against a Mitsuba render of the augmented scene.
 """
 
@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender.exposure import draw_target
 from unirender.intrinsics import Intrinsics
-from unirender.symmetries import LIGHT_MAPS, Maps
+from unirender.light.exposure import draw_target
+from unirender.light.symmetries import LIGHT_MAPS, Maps
 from unirender.training.augmentations.moving import ROLL_DEG, SHIFT, ZOOM, Move
 from unirender.training.config import Augmentation
 

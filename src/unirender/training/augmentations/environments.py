@@ -2,7 +2,7 @@
 
 Turning a map and resampling it are linear, so both are one sparse matrix per (source size, target size, turns). A
 target texel is the integral of the turned bilinear radiance against the texel's own bilinear weight, divided by the
-integral of that weight, as in `unirender.lighting.resample_environment`: the energy of a sun smaller than a texel is
+integral of that weight, as in `light.environment.resample_environment`: the energy of a sun smaller than a texel is
 kept, where sampling the turned map at texel directions would lose or double it.
 
 A map that has that size already would be blurred by such an integral, of its own tent and of the target's.
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
-from unirender.lighting import resample_environment, texel_solid_angles
+from unirender.light.environment import resample_environment, texel_solid_angles
 
 QUADRATURE_TEXELS = 4  # integration points per texel along each axis, on the grid of the source
 QUADRATURE_ROWS = 512  # no more than that, unless the source itself has more
@@ -91,7 +91,7 @@ def _points(height: int, width: int) -> tuple[Float[np.ndarray, "n 3"], Float[np
 def _position(
     directions: Float[np.ndarray, "n 3"], size: tuple[int, int]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Rows and columns, texels at whole numbers, on the grid of `unirender.lighting`."""
+    """Rows and columns, texels at whole numbers, on the grid of `unirender.light.environment`."""
     row = np.arccos(np.clip(directions[:, 1], -1, 1)) * ((size[0] - 1) / np.pi)
     return row, np.arctan2(directions[:, 0], -directions[:, 2]) * (size[1] / (2 * np.pi)) - 0.5
 
@@ -103,7 +103,7 @@ def _texels(directions: Float[np.ndarray, "n 3"], size: tuple[int, int]) -> Int[
 
 
 def _bilinear_matrix(directions: Float[np.ndarray, "n 3"], size: tuple[int, int]) -> csr_array:
-    """Sparse `[n, h w]`: the bilinear weights of `unirender.lighting.sample_environment`."""
+    """Sparse `[n, h w]`: the bilinear weights of `unirender.light.environment.sample_environment`."""
     height, width = size
     row, column = _position(directions, size)
     row_0 = np.clip(np.floor(row).astype(np.int64), 0, height - 2)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.composite import environment_brdf
-from unirender.symmetries import Maps
+from unirender.light.symmetries import Maps
 
 CHANNEL_RANGE = (0.02, 0.98)  # of an object's mean colour: a power takes neither 0 nor 1 elsewhere
 POWER_RANGE = (0.25, 4.0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from unirender.color import luminance
 from unirender.composite import composite_image
-from unirender.exposure import MASK_THRESHOLD
+from unirender.light.exposure import MASK_THRESHOLD
 from unirender.training.data.dataset import GroupDataset
 from unirender.training.data.members import BLACK
 

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from unirender.arguments import as_path
 from unirender.errors import UnirenderError
-from unirender.exposure import exposure_factor
 from unirender.intrinsics import Intrinsics
-from unirender.symmetries import Maps, mirror, permute_channels, quarter_turn, scale_light
+from unirender.light.exposure import exposure_factor
+from unirender.light.symmetries import Maps, mirror, permute_channels, quarter_turn, scale_light
 from unirender.training.augmentations.augment import Draw, draw, from_maps, interpolate_metallic, mix_lights
 from unirender.training.augmentations.moving import moved
 from unirender.training.augmentations.repaint import mean_colour, recoloured, repaint

@@ -2,7 +2,7 @@
 
 The rows of the packed shards lie there as they are stored. What a sample is, `GroupDataset.drawn` says as ever, from
 (seed, index); the operations are twins of those of `unirender.training.augmentations.augment`, `.repaint` and
-`unirender.symmetries`, so that the batches are those of a `ShardSource` to rounding
+`unirender.light.symmetries`, so that the batches are those of a `ShardSource` to rounding
 (tests/unirender/test_device_data.py).
 
 What is linear in the light is a weighted sum of rows. A sample with fewer lights or metallic nodes than others of its
@@ -23,9 +23,9 @@ from torch import Tensor
 from unirender.camera import Camera
 from unirender.color import LUMINANCE_REC709
 from unirender.errors import UnirenderError
-from unirender.exposure import MASK_THRESHOLD, PERCENTILE
+from unirender.light.exposure import MASK_THRESHOLD, PERCENTILE
+from unirender.light.symmetries import COLOUR_MAPS, LIGHT_MAPS
 from unirender.models.priors import PRIORS
-from unirender.symmetries import COLOUR_MAPS, LIGHT_MAPS
 from unirender.training.augmentations.augment import Draw, metallic_weights
 from unirender.training.augmentations.moving import moved
 from unirender.training.augmentations.repaint import CHANNEL_RANGE, POWER_RANGE
@@ -165,7 +165,7 @@ class DeviceGroups:
         return maps
 
     def _turned(self, maps: Batch, turns: Sequence[int]) -> Batch:
-        """Twin of `unirender.symmetries.quarter_turn`; the light has its own."""
+        """Twin of `unirender.light.symmetries.quarter_turn`; the light has its own."""
         for count in range(1, 4):
             rows = [i for i, own in enumerate(turns) if own == count]
             if not rows:
@@ -179,14 +179,14 @@ class DeviceGroups:
         return maps
 
     def _mirrored(self, maps: Batch, flip: Bool[Tensor, " b"]) -> Batch:
-        """Twin of `unirender.symmetries.mirror`."""
+        """Twin of `unirender.light.symmetries.mirror`."""
         rows = flip[:, None, None, None]
         flipped = {name: value.flip(-1) for name, value in maps.items()}
         flipped["normal"] = flipped["normal"] * flipped["normal"].new_tensor([-1, 1, 1])[:, None, None]
         return {name: torch.where(rows, flipped[name], value) for name, value in maps.items()}
 
     def _exposed(self, maps: Batch, draws: Sequence[Draw], keys: Sequence[str]) -> Batch:
-        """The gauge with the drawn targets: twin of `unirender.exposure.exposure_factor`."""
+        """The gauge with the drawn targets: twin of `unirender.light.exposure.exposure_factor`."""
         target = self._tensor([np.nan if draw.exposure_target is None else draw.exposure_target for draw in draws])
         luminance = (maps["diffuse"] * self._tensor(LUMINANCE_REC709)[:, None, None]).sum(dim=1).flatten(1)
         inside = (maps["mask"] > MASK_THRESHOLD).flatten(1)

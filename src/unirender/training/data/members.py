@@ -16,9 +16,9 @@ from jaxtyping import Bool, Float
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender.exposure import MASK_THRESHOLD
 from unirender.exr import CAMERA_ATTRIBUTE, HALF_MAX, Channels, channels_rgb, read_exr_bytes
 from unirender.intrinsics import NORMAL_TOLERANCE, RANGE_TOLERANCE, Intrinsics
+from unirender.light.exposure import MASK_THRESHOLD
 
 KINDS = ("basis", "independent", "one-at-a-time", "paper", "sweep")  # what `vary` may be
 BLACK = 1e-3  # radiance that shows nothing

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float16, Int
 
 from unirender.errors import UnirenderError
-from unirender.symmetries import Maps
+from unirender.light.symmetries import Maps
 from unirender.training.augmentations.augment import METALLIC_NODES
 from unirender.training.data.groups import SCALAR_CHANNELS, Group, Shard
 

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Float16, UInt8
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, read_exr_bytes
-from unirender.lobes import texel_directions
+from unirender.light.lobes import texel_directions
 from unirender.models.visibility import AZIMUTHS, BANDS, bin_weights
 from unirender.paths import cache_dir, cached_folder
 from unirender.pipelines.self_shadow import SelfShadow

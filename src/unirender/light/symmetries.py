@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender.lighting import mirror_environment, rotate_environment
+from unirender.light.environment import mirror_environment, rotate_environment
 
 Maps = dict[str, np.ndarray]
 

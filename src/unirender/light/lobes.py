@@ -17,9 +17,9 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from unirender.ggx import dot, facing_normal, halton, smith_g1, tangents, unit, visible_normals
-from unirender.lighting import check_map, environment_directions, resample_environment, texel_solid_angles
-from unirender.subpixel import inside
+from unirender.light.environment import check_map, environment_directions, resample_environment, texel_solid_angles
+from unirender.light.ggx import dot, facing_normal, halton, smith_g1, tangents, unit, visible_normals
+from unirender.light.subpixel import inside
 
 TAIL_SHAPE = (64, 128)  # texels over which the tails of sharp lobes are integrated
 GRID_DENSITY = 0.03 * (TAIL_SHAPE[0] - 1) * TAIL_SHAPE[1] / (2 * math.pi**2)  # q: 0.03 a texel at the equator
@@ -165,7 +165,7 @@ def sampled_cores(
     widened by what the pixel's curvature adds.
 
     Args:
-        around: surroundings of each pixel (`unirender.subpixel`), normal and view direction.
+        around: surroundings of each pixel (`unirender.light.subpixel`), normal and view direction.
         turn: by how much (radians) the mirror direction turns over a pixel's width and height.
         left: pixels whose lobe is sampled as in a mirror, with left and right exchanged.
         alpha: roughness squared.

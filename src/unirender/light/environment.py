@@ -8,7 +8,7 @@ azimuth phi = 2 pi (j + 1/2) / w, and
 
 The middle of the map is +z (behind the camera), its left and right borders meet at -z (behind the object). Between
 texels radiance is bilinear; all integrals here are exact for that interpolant ("hat" weights). The light that a surface
-receives from a map is in `unirender.surface_light`.
+receives from a map is in `unirender.light.surface_light`.
 """
 
 import functools

@@ -3,12 +3,12 @@
     d(n) = 1/pi integral of E(l) max(n . l, 0) dl,    s(n, v) = integral of E(l) f(l, v) max(n . l, 0) dl
 
 with E the map and f the GGX lobe of a reflector of F = 1: the rendering equation (paper Eq. 1) of two fixed surfaces.
-Both follow from normals, roughness and the map alone (`unirender.lighting` fixes its grid); what the ground truth
+Both follow from normals, roughness and the map alone (`light.environment` fixes its grid); what the ground truth
 renders has shadows besides. `unirender bench derived-light` measures how near they come.
 
 s is averaged over the pixel, as a renderer averages it: a curved surface reflects, within one, more than a sharp lobe
-is wide. How the normal varies in there is taken from the pixels around it (`unirender.subpixel`); how lobes are
-integrated is in `unirender.lobes`.
+is wide. How the normal varies in there is taken from the pixels around it (`unirender.light.subpixel`); how lobes are
+integrated is in `unirender.light.lobes`.
 """
 
 from typing import Any
@@ -18,10 +18,10 @@ from jaxtyping import Bool, Float
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender.ggx import facing_normal, halton, mirror_direction, unit
 from unirender.intrinsics import RANGE_TOLERANCE, as_numbers, unit_normals
-from unirender.lobes import TAIL_SHAPE, grid_lobes, sampled_cores, texels
-from unirender.subpixel import MEAN_WEIGHTS, MIRRORED, Surroundings, inside
+from unirender.light.ggx import facing_normal, halton, mirror_direction, unit
+from unirender.light.lobes import TAIL_SHAPE, grid_lobes, sampled_cores, texels
+from unirender.light.subpixel import MEAN_WEIGHTS, MIRRORED, Surroundings, inside
 from unirender.vectors import nonzero
 
 QUADRATURE_SHAPE = (32, 64)  # resolution at which d and wide lobes are integrated
