@@ -29,8 +29,6 @@ VOCABULARY = {
         "light.ggx",
         "light.surface_light",
         "light.symmetries",
-        "machine",
-        "paths",
         "picture_files.cicp",
         "picture_files.display_files",
         "picture_files.icc",
@@ -38,10 +36,11 @@ VOCABULARY = {
         "picture_files.sixteen_bits",
         "pictures",
         "score",
+        "system.machine",
+        "system.whole_files",
+        "system.worker_pool",
         "vectors",
         "visualization",
-        "whole_files",
-        "worker_pool",
     )
 }
 HEAVY = ("torch", "diffusers", "mitsuba", "drjit", "matplotlib", "skimage", "gradio")

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb
 from unirender.light.environment import mean_radiance, resample_environment
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation.light_metrics import SHAPE
 from unirender_evaluation.metrics import LOG_EPSILON
 from unirender_evaluation.training_statistics import main, shard_files, stored_statistics

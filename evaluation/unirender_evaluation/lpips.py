@@ -21,7 +21,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from unirender.errors import UnirenderError
-from unirender.paths import cache_dir
+from unirender.system.paths import cache_dir
 
 Backbone = Literal["alex", "vgg"]
 BACKBONES: tuple[Backbone, ...] = get_args(Backbone)

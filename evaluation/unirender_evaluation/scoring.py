@@ -18,7 +18,7 @@ from unirender.arguments import as_instance
 from unirender.color import srgb_encode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.machine import memory_excess
+from unirender.system.machine import memory_excess
 from unirender_evaluation import metrics
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.metrics import (

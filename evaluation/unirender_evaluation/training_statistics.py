@@ -20,7 +20,7 @@ import numpy as np
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError
 from unirender.exr import Channels, channels_rgb, read_exr_bytes
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 
 FILE = "data/training_statistics.toml"
 

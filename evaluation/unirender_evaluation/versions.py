@@ -86,7 +86,7 @@ COMMANDS = (
 )
 FROM_RECORDS = ("claims", "comparisons", "statistics", "table_list", "verdict")
 # Of the shared vocabulary's folder: the command line, and processes.
-OUTSIDE = ("__main__", "cli", "shipped", "worker_pool")
+OUTSIDE = ("__main__", "cli", "shipped", "system/worker_pool")
 # The rooms that records are made in, and of the tables what is asked. Results and the report are made from records.
 ROOMS = ("*.py", "methods/*.py", "physics/*.py", "predictions/*.py", "runs/*.py", "suites/*.py", "truth/*.py")
 QUESTIONS = "tables/specs.py"
@@ -145,7 +145,7 @@ NOT_IN_OPTIMIZED = (
 PARTS: Mapping[str, Part] = {
     "core": Part(
         {
-            "unirender": ("*.py", "*.npy", "light/*.py", "picture_files/*.py"),
+            "unirender": ("*.py", "*.npy", "light/*.py", "picture_files/*.py", "system/*.py"),
             "unirender_evaluation": (*ROOMS, QUESTIONS),
             "unirender_reference": LIGHT_READER,
         },

@@ -276,6 +276,7 @@ def _code_hash() -> str:
         ("unirender", "*.py"),
         ("unirender", "light/*.py"),
         ("unirender", "picture_files/*.py"),
+        ("unirender", "system/*.py"),
         ("unirender_reference", "**/*"),
     ):
         spec = importlib.util.find_spec(package)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import aside, replace_file
+from unirender.system.whole_files import aside, replace_file
 from unirender_reference.dataset_sides import MIXES, check_sides
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 from unirender_reference.mesh_folder import MeshFile, files_hash, mesh_folder

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import file_sha256
+from unirender.system.whole_files import file_sha256
 from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.mesh_folder import files_hash
 from unirender_reference.plan import GroupPlan

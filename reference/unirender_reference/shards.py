@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import aside, file_sha256
+from unirender.system.whole_files import aside, file_sha256
 
 MANIFEST = "manifest.json"
 FAILURES = "failures.jsonl"

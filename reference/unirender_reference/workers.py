@@ -3,7 +3,7 @@
 Every worker is a pool of one process, so it is known which task a dead worker had. That task runs once more with no
 other beside it, all the machine's memory its own; if the worker dies again, the task's future raises `WorkerDied`.
 Workers start when the executor is made: their imports run while the caller makes its plan. They end with their parent,
-and at once where it is interrupted (`unirender.worker_pool`).
+and at once where it is interrupted (`unirender.system.worker_pool`).
 """
 
 import threading
@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from unirender.errors import UnirenderError
-from unirender.worker_pool import WorkerPool
+from unirender.system.worker_pool import WorkerPool
 
 
 class WorkerDied(UnirenderError):

@@ -79,8 +79,8 @@ class Doctor:
         import unirender
         from unirender.command_line.writing import unusable
         from unirender.models.precision import resolve_device, resolve_dtype
-        from unirender.paths import cache_dir
         from unirender.shipped import shipped_names
+        from unirender.system.paths import cache_dir
         from unirender_evaluation.lpips import available
         from unirender_reference.backend import doctor
 

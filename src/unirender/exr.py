@@ -20,7 +20,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
 from unirender.picture_files.primaries import in_rec709
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 
 Channels = dict[str, Float[np.ndarray, "h w"]]
 

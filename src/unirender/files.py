@@ -37,10 +37,10 @@ from unirender.exr import (
     write_exr,
 )
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
-from unirender.paths import forget_half_made
+from unirender.system.paths import forget_half_made
+from unirender.system.whole_files import move_into_place, naming
 from unirender.visualization import map_picture as map_picture  # known by this name, too
 from unirender.visualization import write_map_png, write_png
-from unirender.whole_files import move_into_place, naming
 
 INTRINSICS_FILE, ENVIRONMENT_FILE, IMAGE_FILE, META_FILE = "intrinsics.exr", "environment.exr", "image.exr", "meta.json"
 SUMMARY_FILE = "summary.json"  # of a folder of results

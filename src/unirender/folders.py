@@ -24,11 +24,11 @@ from unirender.files import (
     write_result,
 )
 from unirender.intrinsics import MAPS
-from unirender.paths import forget_half_made
 from unirender.picture_files.display_files import RAW_SUFFIXES
 from unirender.pictures import Picture, checked_file
+from unirender.system.paths import forget_half_made
+from unirender.system.whole_files import replace_file
 from unirender.visualization import write_png
-from unirender.whole_files import replace_file
 
 if TYPE_CHECKING:
     from unirender.pipelines.results import Decomposition

@@ -104,7 +104,7 @@ def test_a_picture_is_not_refused_for_the_memory_of_taking_it_apart_at_its_own_s
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     taken = Upload("a.png", png(np.full((100, 100, 3), 0.5)))
-    monkeypatch.setattr("unirender.machine.memory_bytes", lambda: BYTES_OF_NONE + 60 * 100 * 100)
+    monkeypatch.setattr("unirender.system.machine.memory_bytes", lambda: BYTES_OF_NONE + 60 * 100 * 100)
     assert read_upload(taken, None, LIMITS)[0].image_srgb.shape == (100, 100, 3)
 
 

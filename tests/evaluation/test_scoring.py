@@ -231,7 +231,7 @@ def test_lpips_by_hand(own: np.ndarray | None) -> None:
 def test_what_the_machine_is_too_small_for_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 4k pictures a process ended without a word."""
     picture, mask = np.zeros((1024, 1024, 3), np.float32), np.ones((1024, 1024, 1), np.float32)
-    monkeypatch.setattr("unirender.machine.memory_bytes", lambda: 6e8)
+    monkeypatch.setattr("unirender.system.machine.memory_bytes", lambda: 6e8)
     with pytest.raises(UnirenderError, match=r"scoring relit: 1\.05 megapixels, which would take about 0\.7 GiB of"):
         score_image(picture, picture, mask)
     with pytest.raises(UnirenderError, match=r"scoring maps: .* about 1\.0 GiB .*scale both sides down, or leave out"):

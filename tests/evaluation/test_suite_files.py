@@ -15,7 +15,7 @@ from tiny_suites import write_suite
 
 from unirender.cli import main
 from unirender.errors import UnirenderError
-from unirender.whole_files import file_sha256
+from unirender.system.whole_files import file_sha256
 from unirender_evaluation.lpips import SMALLEST
 from unirender_evaluation.results import check as results_check
 from unirender_evaluation.results.listing import suites as listed_suites

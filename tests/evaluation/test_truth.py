@@ -14,7 +14,7 @@ from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, intrinsics_from_channels, read_exr_bytes
-from unirender.whole_files import file_sha256
+from unirender.system.whole_files import file_sha256
 from unirender_evaluation.methods.ceiling import noise_ceiling, similarity_ceiling
 from unirender_evaluation.scoring import score_colour, score_image
 from unirender_evaluation.suites.definition import recorded

@@ -67,7 +67,7 @@ if __name__ == "__main__":
 POOL = """
 import os, signal
 from hold import hold
-from unirender.worker_pool import WorkerPool
+from unirender.system.worker_pool import WorkerPool
 
 def start(handled):
     "As Mitsuba does while it renders, and as libraries do that want to end in order."

@@ -123,7 +123,7 @@ def test_a_map_that_the_machine_is_too_small_for_is_refused_by_its_header(
         write_exr(tmp_path / file, image_channels(np.ones((rows, 2 * rows, 3))))
     if start is not None:
         (tmp_path / name).write_bytes(start)
-    monkeypatch.setattr("unirender.machine.memory_bytes", lambda: BYTES_OF_NONE + BYTES_A_TEXEL * texels - 1)
+    monkeypatch.setattr("unirender.system.machine.memory_bytes", lambda: BYTES_OF_NONE + BYTES_A_TEXEL * texels - 1)
     with pytest.raises(UnirenderError, match=r"million texels, which would take about [\d.]+ GiB .*; scale it down"):
         load_light(tmp_path / name)
     assert load_light(tmp_path / "small.exr", shape=(4, 8)).environment.shape == (4, 8, 3)

@@ -107,7 +107,7 @@ def test_a_table_is_printed_although_its_sheet_finds_no_place(
     def full(path: Path, content: bytes) -> None:
         raise OSError(errno.ENOSPC, NO_SPACE)
 
-    monkeypatch.setattr("unirender.whole_files.replace_file", full)
+    monkeypatch.setattr("unirender.system.whole_files.replace_file", full)
     with pytest.raises(UnirenderError, match=rf"--sheet .*s\.png: cannot be written \({NO_SPACE}\)"):
         Lights(split="test", sheet=tmp_path / "s.png").run()
     assert "lights of 64 x 128 texels" in capsys.readouterr().out

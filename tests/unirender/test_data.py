@@ -20,7 +20,7 @@ from unirender.light.environment import mean_radiance, resample_environment, rot
 from unirender.light.exposure import PERCENTILE, TARGET_RANGE, exposure_factor
 from unirender.light.surface_light import diffuse_light, specular_light
 from unirender.light.symmetries import turn_rotation
-from unirender.paths import cache_dir
+from unirender.system.paths import cache_dir
 from unirender.training.augmentations.augment import (
     DEFAULT_AUGMENTATION,
     NO_AUGMENTATION,

@@ -20,7 +20,7 @@ from unirender.exr import image_channels, intrinsics_channels, on_pole_grid, rea
 from unirender.files import new_folder, read_result, write_result
 from unirender.intrinsics import Intrinsics
 from unirender.shipped import checkpoint_sha256
-from unirender.whole_files import replace_file, whole_file
+from unirender.system.whole_files import replace_file, whole_file
 
 RNG = np.random.default_rng(0)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from unirender.machine import GIB, memory_bytes, memory_excess, needs_swap, peak_bytes, unswapped_bytes
+from unirender.system.machine import GIB, memory_bytes, memory_excess, needs_swap, peak_bytes, unswapped_bytes
 
 NONE = 9223372036854771712  # what the first version of control groups says where nothing is limited
 INNER = "system.slice/job.scope"
@@ -17,7 +17,7 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder for files of the system's; the machine has 8 GiB, without swap and control groups."""
     monkeypatch.setattr("os.sysconf", lambda name: 8 * 2**18 if name == "SC_PHYS_PAGES" else 4096)
     for name, file in (("GROUPS", "cgroup"), ("GROUPS_ROOT", "groups"), ("SWAPS", "meminfo")):
-        monkeypatch.setattr(f"unirender.machine.{name}", tmp_path / file)
+        monkeypatch.setattr(f"unirender.system.machine.{name}", tmp_path / file)
     return tmp_path
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from unirender.errors import UnirenderError
 from unirender.files import new_folder
-from unirender.paths import cache_dir, cached_folder
-from unirender.whole_files import replace_file
+from unirender.system.paths import cache_dir, cached_folder
+from unirender.system.whole_files import replace_file
 from unirender_evaluation.suites.truth_file import write_tar
 from unirender_reference.shards import write_shard
 

@@ -468,7 +468,7 @@ def test_a_picture_that_the_machine_is_too_small_for_is_refused(
 ) -> None:
     Image.new("RGB", (400, 300), "white").save(tmp_path / "a.png")
     needed = BYTES_OF_NONE + BYTES_A_PIXEL * 400 * 300
-    monkeypatch.setattr("unirender.machine.memory_bytes", lambda: needed)
+    monkeypatch.setattr("unirender.system.machine.memory_bytes", lambda: needed)
     read_input(tmp_path / "a.png", None)
     source, out = InputOptions(tmp_path / "a.png"), OutputOptions(tmp_path / "out")
     with pytest.raises(UnirenderError, match=r"a picture of 0\.12 megapixels"):
@@ -477,11 +477,11 @@ def test_a_picture_that_the_machine_is_too_small_for_is_refused(
         Decompose(source, out, decomposition=DecompositionOptions(tile=True)).run()
     with pytest.raises(UnirenderError, match=r"for it; scale it down first, or ask for fewer --samples"):
         read_input(tmp_path / "a.png", None, samples=2)
-    monkeypatch.setattr("unirender.machine.unswapped_bytes", lambda: needed - 1)
+    monkeypatch.setattr("unirender.system.machine.unswapped_bytes", lambda: needed - 1)
     assert read_input(tmp_path / "a.png", None)[1]["memory"].endswith(
         "without swap: it may be very slow; scale it down"
     )
-    monkeypatch.setattr("unirender.machine.memory_bytes", lambda: needed - 1)
+    monkeypatch.setattr("unirender.system.machine.memory_bytes", lambda: needed - 1)
     with pytest.raises(
         UnirenderError, match=r"a picture of 0\.12 megapixels.* about 0\.5 GiB .* has 0\.4 GiB for it; scale"
     ):
@@ -497,7 +497,7 @@ def test_maps_that_the_machine_is_too_small_for_are_refused_before_they_are_read
     write_exr(tmp_path / "a.exr", {"roughness.Y": np.zeros((300, 400), np.float32)})
     needed = BYTES_OF_NONE + RENDERED_BYTES_A_PIXEL * 400 * 300
     render = Render(tmp_path / "a.exr", OutputOptions(tmp_path / "out"))
-    monkeypatch.setattr("unirender.machine.memory_bytes", lambda: needed)
+    monkeypatch.setattr("unirender.system.machine.memory_bytes", lambda: needed)
     with pytest.raises(UnirenderError, match="normal"):  # read, and found wanting
         render.run(np.asarray)
     with pytest.raises(UnirenderError, match=r"a\.exr: a picture of 0\.12 megapixels, which would take about"):

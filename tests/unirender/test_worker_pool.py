@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from unirender import worker_pool
-from unirender.worker_pool import WorkerPool, exit_with_parent
+from unirender.system import worker_pool
+from unirender.system.worker_pool import WorkerPool, exit_with_parent
 
 PARENT = """
 import multiprocessing, os, sys, time
 from concurrent.futures import ProcessPoolExecutor
-from unirender.worker_pool import WorkerPool, exit_with_parent
+from unirender.system.worker_pool import WorkerPool, exit_with_parent
 
 def hang():
     print(os.getpid(), flush=True)
@@ -106,7 +106,7 @@ def test_the_main_process_has_no_such_parent() -> None:
 HUNG_UP = """
 import time
 from unirender.command_line.process_ends import hear_ends
-from unirender.worker_pool import WorkerPool
+from unirender.system.worker_pool import WorkerPool
 
 if __name__ == "__main__":
     hear_ends()

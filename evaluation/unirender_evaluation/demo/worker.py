@@ -22,7 +22,7 @@ from typing import Any
 
 from unirender.errors import UnirenderError
 from unirender.pipelines.remembered import forget_pictures
-from unirender.worker_pool import exit_with_parent, start_tracker
+from unirender.system.worker_pool import exit_with_parent, start_tracker
 
 START_SECONDS = 300.0  # for loading a model on a busy machine
 logger = logging.getLogger(__name__)

@@ -160,7 +160,7 @@ class Figures:
 
     def explain(self, kind: Contract, suite: "Suite", scene: "Scene") -> Path:
         """A figure of the data contract."""
-        from unirender.whole_files import replace_file
+        from unirender.system.whole_files import replace_file
         from unirender_evaluation.figures import contract
 
         drawn = contract.maps_figure(suite, scene) if kind == "maps" else contract.camera_figure(suite.spec.camera)

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from unirender.color import eight_bits
 from unirender.errors import UnirenderError
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 
 SIDE = 128  # of a cell, pixels, about: the nearest whole multiple of the pictures' own size, and never less than it
 WIDEST = 6  # columns beside one another; the others follow below, all rows again

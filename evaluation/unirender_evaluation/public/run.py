@@ -20,7 +20,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation import lpips
 from unirender_evaluation.predictions.check import PredictionError, folder_problems
 from unirender_evaluation.public.answers import asked, questions, read_answer, takes_part

@@ -20,7 +20,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.picture_files.display_files import srgb_values, stored_values
-from unirender.whole_files import file_sha256
+from unirender.system.whole_files import file_sha256
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.tables.specs import TableSpec

@@ -17,7 +17,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation.comparisons import Selection, verdicts
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.records import METHOD_KINDS, Record, RunInfo

@@ -20,7 +20,7 @@ from PIL.PngImagePlugin import PngInfo
 from unirender.color import eight_bits, image_srgb
 from unirender.intrinsics import Intrinsics
 from unirender.light.environment import sample_environment
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation.engine import Prediction
 from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL, ball_mask, ball_normals, balls
 from unirender_evaluation.metrics import METRICS, Variant, metric_key

@@ -22,7 +22,7 @@ from typing import Any
 
 from unirender.arguments import as_path
 from unirender.errors import UnirenderError
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation.comparisons import Lights
 from unirender_evaluation.records import (
     SCHEMA_VERSION,

@@ -25,7 +25,7 @@ from safetensors import safe_open
 
 from unirender.errors import UnirenderError
 from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for, shipped_names, trained_pixels
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.light_balls import MATTE_BALL
 from unirender_evaluation.records import Record

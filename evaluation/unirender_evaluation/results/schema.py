@@ -14,7 +14,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation.metrics import METRICS
 from unirender_evaluation.records import SCHEMA_VERSION, MethodInfo, Record, RunInfo
 

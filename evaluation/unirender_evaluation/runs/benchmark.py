@@ -26,7 +26,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation import bounds, subsets
 from unirender_evaluation.methods.mitsuba import MITSUBA
 from unirender_evaluation.multiview.pictures import MultiviewPictures

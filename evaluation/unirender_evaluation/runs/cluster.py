@@ -13,7 +13,7 @@ from typing import Any
 from uuid import uuid4
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation.records import Record
 from unirender_evaluation.rows import Row
 from unirender_evaluation.runs.workers import Run

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation.records import Record
 from unirender_evaluation.rows import Row
 from unirender_evaluation.suites.suite import Scene, Suite

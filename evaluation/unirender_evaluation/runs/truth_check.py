@@ -16,7 +16,7 @@ from typing import Any
 
 from rich.progress import Progress
 
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation import bounds
 from unirender_evaluation.engine import Prediction, record_of, score
 from unirender_evaluation.records import MethodInfo, Record

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from unirender.errors import UnirenderError
-from unirender.worker_pool import WorkerPool
+from unirender.system.worker_pool import WorkerPool
 from unirender_evaluation.bounds import KeyOf, ceiling_jobs
 from unirender_evaluation.engine import method_jobs
 from unirender_evaluation.methods.mitsuba import mitsuba_jobs

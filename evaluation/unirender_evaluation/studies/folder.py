@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation.studies.about import line
 from unirender_evaluation.tables.text import TextTable
 from unirender_reference.folder_lock import locked, made_folder

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from unirender.errors import UnirenderError
-from unirender.paths import cache_dir
+from unirender.system.paths import cache_dir
 from unirender_evaluation.suites.spec import (
     SuiteSpec,
     is_bundled,

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender.light.environment import resample_environment
-from unirender.whole_files import file_sha256
+from unirender.system.whole_files import file_sha256
 from unirender_evaluation.suites.objects import drawn, missing_folder
 from unirender_evaluation.suites.spec import SuiteSpec
 from unirender_reference.mesh_folder import MeshFile

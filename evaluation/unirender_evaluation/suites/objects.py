@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import file_sha256
+from unirender.system.whole_files import file_sha256
 from unirender_evaluation.suites.spec import Files, SuiteSpec
 from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_reference.mesh_folder import MeshFile, in_split, mesh_folder

@@ -36,7 +36,7 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender.exr import Channels
-from unirender.whole_files import aside
+from unirender.system.whole_files import aside
 from unirender_evaluation.suites.stratification import MetallicRoughness, material_key, roughness_key
 
 Kind = Literal["image", "specular", "diffuse"]

@@ -90,7 +90,7 @@ class BenchTruth:
         """Renders the truth and prints what its noise leaves possible."""
         from rich.console import Console
 
-        from unirender.paths import cache_dir
+        from unirender.system.paths import cache_dir
         from unirender_evaluation.run_progress import progress_bar
         from unirender_evaluation.suites.home import target
         from unirender_evaluation.suites.suite import load_suite

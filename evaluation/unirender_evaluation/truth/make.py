@@ -20,8 +20,8 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, image_channels
-from unirender.whole_files import replace_file
-from unirender.worker_pool import WorkerPool
+from unirender.system.whole_files import replace_file
+from unirender.system.worker_pool import WorkerPool
 from unirender_evaluation.suites.definition import recorded
 from unirender_evaluation.suites.home import target
 from unirender_evaluation.suites.lights import Pool, SuiteLight, assign_lights, light_sources, load_lights

@@ -20,7 +20,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from unirender.intrinsics import Intrinsics
-from unirender.whole_files import replace_file, whole_file
+from unirender.system.whole_files import replace_file, whole_file
 
 Arrays = Mapping[str, np.ndarray]
 

@@ -31,10 +31,10 @@ from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, image_channels, on_pole_grid, pixel_count, read_exr
 from unirender.light.environment import check_shape, resample_environment
-from unirender.machine import memory_excess
 from unirender.picture_files import display_files
 from unirender.picture_files.primaries import REC709, in_rec709
 from unirender.pictures import check_finite, negative_share
+from unirender.system.machine import memory_excess
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import SHAPE, Light, area_resampled, mean_luminance
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from unirender.worker_pool import WorkerPool
+from unirender.system.worker_pool import WorkerPool
 from unirender_reference import backend
 from unirender_reference.lights import make_light
 from unirender_reference.passes import derive_seed

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UsageError
-from unirender.worker_pool import WorkerPool
+from unirender.system.worker_pool import WorkerPool
 
 if TYPE_CHECKING:
     from unirender_reference.render import Renderer
@@ -134,7 +134,7 @@ def measure(resolution: int, spp: int, scenes: int) -> Figures:
     """Figures of a resolution, in this process with one thread."""
     import statistics
 
-    from unirender.machine import peak_bytes
+    from unirender.system.machine import peak_bytes
     from unirender_reference import backend
     from unirender_reference.lights import make_light
     from unirender_reference.render import Renderer

@@ -116,7 +116,7 @@ class MeshSummary:
         import numpy as np
         from rich.table import Table
 
-        from unirender.machine import peak_bytes
+        from unirender.system.machine import peak_bytes
 
         table = Table("", "", show_header=False)
         table.add_row("meshes", f"{len(self.seconds):,}")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from unirender.errors import UsageError
-from unirender.worker_pool import WorkerPool
+from unirender.system.worker_pool import WorkerPool
 from unirender_reference.processes import start_worker
 
 if TYPE_CHECKING:

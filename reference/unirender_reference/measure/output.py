@@ -44,7 +44,7 @@ def write_file(option: str, path: Path, content: str | bytes) -> None:
     Raises:
         UnirenderError: it cannot be written; what was there stays.
     """
-    from unirender.whole_files import replace_file
+    from unirender.system.whole_files import replace_file
 
     with writing(f"{option} {path}", ELSEWHERE):
         if _is_special(path):

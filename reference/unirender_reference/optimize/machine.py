@@ -4,7 +4,7 @@ import os
 from collections.abc import Mapping
 
 from unirender.errors import UnirenderError
-from unirender.machine import memory_excess
+from unirender.system.machine import memory_excess
 
 
 def require_cores(threads: int) -> None:

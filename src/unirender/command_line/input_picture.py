@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from unirender.errors import UnirenderError
-from unirender.machine import memory_excess, needs_swap
+from unirender.system.machine import memory_excess, needs_swap
 
 if TYPE_CHECKING:
     from unirender.pictures import Picture

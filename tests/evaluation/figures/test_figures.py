@@ -16,7 +16,7 @@ from unirender.command_line.options import ModelOptions
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
-from unirender.whole_files import replace_file
+from unirender.system.whole_files import replace_file
 from unirender_evaluation.figures import grid as grid_module
 from unirender_evaluation.figures import light as light_module
 from unirender_evaluation.figures import overview as overview_module

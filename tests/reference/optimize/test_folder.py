@@ -476,6 +476,6 @@ def test_more_pictures_than_fit_are_refused_before_they_are_read_or_worked_on(
     count, pixels = len(views.seen) + len(views.held_out), views.height * views.width
     config = OptimizeConfig(TransportConfig(enabled=False), texture_size=4, light_rows=8)
     for bytes_of_pixel, does in ((15, lambda: read_views(folder)), (100, lambda: optimize(views, None, config))):
-        monkeypatch.setattr("unirender.machine.memory_bytes", lambda most=bytes_of_pixel * count * pixels: most)
+        monkeypatch.setattr("unirender.system.machine.memory_bytes", lambda most=bytes_of_pixel * count * pixels: most)
         with pytest.raises(UnirenderError, match=rf"^{count} pictures of .* pixels: would take .*--most-views, --size"):
             does()

@@ -23,7 +23,7 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.exr import channels_rgb, image_channels, read_exr, write_exr
 from unirender.files import read_result, write_result
 from unirender.intrinsics import MAPS, Intrinsics
-from unirender.machine import memory_bytes
+from unirender.system.machine import memory_bytes
 from unirender.visualization import write_png
 from unirender_reference.meshes import load_mesh_placed
 from unirender_reference.optimize.commands import Optimize

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import whole_file
+from unirender.system.whole_files import whole_file
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.shapes import MeshObject
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import whole_file
+from unirender.system.whole_files import whole_file
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 from unirender_reference.optimize.files.solution import read_solution_file, write_solution_file
 from unirender_reference.optimize.solution import Solution

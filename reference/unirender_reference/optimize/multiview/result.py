@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from unirender.whole_files import file_sha256
+from unirender.system.whole_files import file_sha256
 from unirender_reference.optimize.files.export import SOLUTION_FILE, write_record, write_solution
 from unirender_reference.optimize.files.state import RunFolder
 from unirender_reference.optimize.multiview.exposure import divided_views, exposure_of_views, lit

@@ -13,7 +13,7 @@ from typing import Any
 
 from unirender.arguments import as_instance, as_path
 from unirender.errors import UnirenderError
-from unirender.whole_files import file_sha256
+from unirender.system.whole_files import file_sha256
 from unirender_reference.backend import renderer_threads
 from unirender_reference.optimize.files.solution import read_solution_file, write_solution_file
 from unirender_reference.optimize.files.state import RunFolder, fingerprint, open_run

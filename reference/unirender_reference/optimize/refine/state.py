@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender.whole_files import whole_file
+from unirender.system.whole_files import whole_file
 from unirender_reference.optimize.numerics.descent import PyramidAdam
 from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.refine.parameters import NAMES, Name, to_map, to_parameter

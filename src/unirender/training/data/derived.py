@@ -26,10 +26,10 @@ from unirender.errors import UnirenderError
 from unirender.exr import HALF_MAX
 from unirender.intrinsics import Intrinsics
 from unirender.light.surface_light import diffuse_light, specular_light
-from unirender.paths import cache_dir, cached_folder
 from unirender.pipelines.shadowed_light import SeenShadows
+from unirender.system.paths import cache_dir, cached_folder
+from unirender.system.worker_pool import WorkerPool
 from unirender.training.data.groups import Group, Shard, mapped, read_environments, store
-from unirender.worker_pool import WorkerPool
 
 logger = logging.getLogger(__name__)
 

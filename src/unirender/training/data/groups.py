@@ -28,9 +28,9 @@ from jaxtyping import Float, Float16
 
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, read_exr_bytes
-from unirender.paths import cache_dir, cached_folder
+from unirender.system.paths import cache_dir, cached_folder
+from unirender.system.whole_files import file_sha256
 from unirender.training.data.packing import SCALAR_CHANNELS, Group, Packer, Pair
-from unirender.whole_files import file_sha256
 
 PACK_VERSION = 3  # part of the cache's path: raise it when what is packed, or refused, changes
 END_OF_ARCHIVE = bytes(1024)  # two blocks, with which a tar ends

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from unirender.command_line.writing import writing
+from unirender.system.whole_files import whole_file
 from unirender.training.logs.live import Report
 from unirender.training.optim.processes import Processes
-from unirender.whole_files import whole_file
 
 LOG_FILE = "log.jsonl"
 NEWS = {"data", "parts"}  # entries of lines on what holds from their step on

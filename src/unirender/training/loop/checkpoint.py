@@ -12,9 +12,9 @@ import torch
 from unirender.command_line.writing import writing
 from unirender.errors import UnirenderError
 from unirender.models.config import GONE as GONE_FROM_NETWORKS
+from unirender.system.whole_files import whole_file
 from unirender.training.config import TrainConfig
 from unirender.training.loop.card import OF_A_RUN
-from unirender.whole_files import whole_file
 
 STATE_FILE = "state.pt"
 PICTURES = "pictures"

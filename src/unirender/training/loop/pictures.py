@@ -13,8 +13,8 @@ from unirender.command_line.writing import writing
 from unirender.diffusion.inference import infer_attributes, infer_image
 from unirender.models.packing import TRIPLETS
 from unirender.models.priors import Maps
+from unirender.system.whole_files import whole_file
 from unirender.training.losses.loss_function import LossFunction
-from unirender.whole_files import whole_file
 
 SHEET_ROWS = 4  # samples of a sheet
 COLUMNS = ("image", "albedo", "normal", "material", "specular", "diffuse", "environment")

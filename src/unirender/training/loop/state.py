@@ -8,12 +8,12 @@ import torch
 
 from unirender.command_line.writing import writing
 from unirender.errors import UnirenderError
+from unirender.system.whole_files import whole_file
 from unirender.training.data.source import BatchSource
 from unirender.training.logs.live import Report
 from unirender.training.loop.beginning import check_beginning
 from unirender.training.loop.checkpoint import differences, load_state, plain
 from unirender.training.optim.passes import laid_out_like
-from unirender.whole_files import whole_file
 
 if TYPE_CHECKING:
     from unirender.training.loop.trainer import Trainer

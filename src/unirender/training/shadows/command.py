@@ -233,7 +233,7 @@ class _Run:
         """Writes the weights of a network."""
         from safetensors.torch import save
 
-        from unirender.whole_files import whole_file
+        from unirender.system.whole_files import whole_file
 
         halves = {name: value.half().contiguous() for name, value in shown.state_dict().items()}
         with writing(path := self.options.out / WEIGHTS_FILE), whole_file(path) as file:

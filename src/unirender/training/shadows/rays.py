@@ -23,13 +23,13 @@ from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, read_exr_bytes
 from unirender.light.lobes import texel_directions
 from unirender.models.visibility import AZIMUTHS, BANDS, bin_weights
-from unirender.paths import cache_dir, cached_folder
 from unirender.pipelines.self_shadow import SelfShadow
+from unirender.system.paths import cache_dir, cached_folder
+from unirender.system.whole_files import file_sha256
+from unirender.system.worker_pool import WorkerPool
 from unirender.training.data.derived import one_thread
 from unirender.training.data.groups import list_shards, read_groups, split_of
 from unirender.training.data.same_objects import object_of
-from unirender.whole_files import file_sha256
-from unirender.worker_pool import WorkerPool
 
 VERSION = 1  # part of the cache's path: raise it when the masks or the bins change
 DIRECTIONS = (16, 32)  # of the traced rays: texels of a lat-long map
