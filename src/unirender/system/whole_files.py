@@ -8,7 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 from unirender.errors import UnirenderError
 
@@ -23,17 +23,8 @@ def replace_file(path: Path, content: str | bytes) -> Path:
         OSError: it cannot be written; what was there stays.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = aside(path, "partial")
-    try:
-        with naming(path), temporary.open("xb") as file:
-            file.write(content if isinstance(content, bytes) else content.encode())
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
+    with _renamed(path, aside(path, "partial"), "xb") as file:
+        file.write(content if isinstance(content, bytes) else content.encode())
     return path
 
 
@@ -46,15 +37,19 @@ def aside(path: Path, ending: str) -> Path:
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}.{ending}")
 
 
-@contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[BinaryIO]:
+def whole_file(path: Path) -> contextlib.AbstractContextManager[BinaryIO]:
     """A stream to what will be the file when the block ends; where that fails, what was there stays, and nothing else.
 
     For a folder that one process writes to: all write aside to one name, so that a killed one leaves no more than that.
     """
-    temporary = path.with_name(f".{path.name}.part")
+    return _renamed(path, path.with_name(f".{path.name}.part"), "wb")
+
+
+@contextlib.contextmanager
+def _renamed(path: Path, temporary: Path, mode: Literal["wb", "xb"]) -> Iterator[BinaryIO]:
+    """A stream to `temporary`, which is synced and becomes `path` when the block ends."""
     try:
-        with naming(path), temporary.open("wb") as file:
+        with naming(path), temporary.open(mode) as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
