@@ -3,8 +3,6 @@
 Notation: m, r are metallic and (perceptual) roughness; a material is the pair (m, r).
 """
 
-from collections import Counter
-
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -86,16 +84,3 @@ def _even_remainder(
         return first
     draws = rng.permuted(np.tile(np.arange(len(cells)), (DRAWS, 1)), axis=1)[:, :remainder]
     return draws[np.argmin(off(draws))]
-
-
-def constant_mse(materials: list[list[MetallicRoughness]]) -> tuple[float, float]:
-    """MSE that the constant 0.5 scores for (metallic, roughness) over all scenes' materials."""
-    flat = np.array([material for scene in materials for material in scene])
-    mse = np.mean((flat - 0.5) ** 2, axis=0)
-    return float(mse[0]), float(mse[1])
-
-
-def level_counts(materials: list[list[MetallicRoughness]]) -> tuple[Counter, Counter]:
-    """How often each level of metallic and of roughness occurs."""
-    flat = [material for scene in materials for material in scene]
-    return Counter(m for m, _ in flat), Counter(r for _, r in flat)
