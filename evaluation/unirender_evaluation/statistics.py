@@ -287,12 +287,12 @@ def paired_p_value(a: Mapping[str, float], b: Mapping[str, float], clusters: Map
     return float(2 * stdtr(len(sums) - 1, -t))
 
 
-def holm(p_values: Sequence[float], level: float = 1 - CONFIDENCE) -> list[bool]:
-    """Which of several hypotheses are refused when the chance of any false refusal is at most `level` (Holm 1979)."""
+def holm(p_values: Sequence[float]) -> list[bool]:
+    """Which of several hypotheses are refused, with a chance of one in twenty of any false refusal (Holm 1979)."""
     order = np.argsort(p_values, kind="stable")
     refused = [False] * len(p_values)
     for rank, index in enumerate(order):
-        if p_values[index] > level / (len(p_values) - rank):
+        if p_values[index] > (1 - CONFIDENCE) / (len(p_values) - rank):
             break
         refused[index] = True
     return refused
