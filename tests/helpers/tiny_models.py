@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -74,3 +75,16 @@ def make_pipeline(seed: int = 0, **changes: object) -> UniRenderPipeline:
     pipeline = UniRenderPipeline(dual_stream=model, scheduler=make_scheduler())
     pipeline.set_progress_bar_config(disable=True)
     return pipeline
+
+
+def counted_rows(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many rows each pass of a network has from now on."""
+    rows: list[int] = []
+    forward = DualStreamModel.forward
+
+    def counted(self: DualStreamModel, *args: Any, **kwargs: Any) -> Any:
+        rows.append(len(args[0]))
+        return forward(self, *args, **kwargs)
+
+    monkeypatch.setattr(DualStreamModel, "forward", counted)
+    return rows

@@ -11,7 +11,7 @@ import torch
 from accelerate import cpu_offload
 from diffusers.pipelines.pipeline_utils import DiffusionPipeline
 from PIL import Image
-from tiny_models import SIZE, make_pipeline
+from tiny_models import SIZE, counted_rows, make_pipeline
 
 from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode
@@ -128,14 +128,7 @@ def test_a_size_that_the_network_cannot_take_is_refused(pipeline: UniRenderPipel
 
 def test_a_batch_is_one_pass_and_each_picture_is_what_it_is_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     pipeline = make_pipeline()
-    rows: list[int] = []
-    forward = DualStreamModel.forward
-
-    def counted(self: DualStreamModel, *args: Any, **kwargs: Any) -> Any:
-        rows.append(len(args[0]))
-        return forward(self, *args, **kwargs)
-
-    monkeypatch.setattr(DualStreamModel, "forward", counted)
+    rows = counted_rows(monkeypatch)
     pictures = [picture(), picture(50, 37), picture(20, 90)]
     images, masks = [p[0] for p in pictures], [p[1] for p in pictures]
     cameras = [Camera(), Camera(fov_deg=60.0), Camera(principal=(0.4, 0.6))]

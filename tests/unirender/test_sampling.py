@@ -11,7 +11,7 @@ import pytest
 import torch
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
-from tiny_models import SIZE, make_batch, make_model, make_pipeline
+from tiny_models import SIZE, counted_rows, make_batch, make_model, make_pipeline
 from torch import Tensor
 
 from unirender.camera import Camera
@@ -307,14 +307,7 @@ def test_extras_of_each_camera() -> None:
 def test_the_sampler_by_name_and_by_component(monkeypatch: pytest.MonkeyPatch) -> None:
     pipeline = make_pipeline()
     image = np.random.default_rng(0).uniform(0, 1, (SIZE, SIZE, 3)).astype(np.float32)
-    passes = []
-    forward = DualStreamModel.forward
-
-    def counted(self: DualStreamModel, *args: Any, **kwargs: Any) -> Any:
-        passes.append(len(args[0]))
-        return forward(self, *args, **kwargs)
-
-    monkeypatch.setattr(DualStreamModel, "forward", counted)
+    passes = counted_rows(monkeypatch)
 
     def albedo(**sampling: Any) -> np.ndarray:
         settings: dict[str, Any] = {"mode": "sample", "num_inference_steps": 4, "num_samples": 2} | sampling

@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny_models import SIZE, make_pipeline
+from tiny_models import SIZE, counted_rows, make_pipeline
 
 from unirender.camera import Camera
 from unirender.command_line.remarks import frame_remarks
 from unirender.intrinsics import Intrinsics
-from unirender.models.dual_stream import DualStreamModel
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.masked_maps import divide, unit_normal
 from unirender.pipelines.tiling import TILED, TILES_AT_ONCE, add_detail, blend_tiles, tiles, tiles_of, window
@@ -185,14 +184,7 @@ def seeded(seed: int) -> torch.Generator:
 
 def test_tiles_without_the_object_are_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     pipeline = make_pipeline()
-    rows: list[int] = []
-    forward = DualStreamModel.forward
-
-    def counted(self: DualStreamModel, *args: Any, **kwargs: Any) -> Any:
-        rows.append(len(args[0]))
-        return forward(self, *args, **kwargs)
-
-    monkeypatch.setattr(DualStreamModel, "forward", counted)
+    rows = counted_rows(monkeypatch)
     image = np.full((4 * SIZE, 4 * SIZE, 3), 0.5, dtype=np.float32)
     mask = np.zeros((4 * SIZE, 4 * SIZE, 1), dtype=np.float32)
     mask[:SIZE, :SIZE] = 1
