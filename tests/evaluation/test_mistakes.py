@@ -7,6 +7,7 @@ import pytest
 
 from unirender.color import srgb_decode, srgb_encode
 from unirender.intrinsics import Intrinsics
+from unirender_evaluation.light_metrics import scaled_log_rmse
 from unirender_evaluation.methods.mistakes import (
     MOST_DB,
     colour_gains,
@@ -42,6 +43,13 @@ def test_colours_and_lights_tell_in_which_order_they_are(mistake: str) -> None:
 def test_a_light_tells_a_half_turn_whatever_its_size_and_level() -> None:
     assert only(light_gains(np.roll(7 * LIGHT, 16, axis=1), LIGHT)) == ["if_turned"]
     assert max(light_gains(np.roll(LIGHT, 8, axis=1), LIGHT).values()) < 1, "a quarter"
+
+
+def test_the_gain_of_a_light_is_that_of_its_squared_log_rmse() -> None:
+    found = LEFT(LIGHT) + np.float32(0.2) * RNG.random(LIGHT.shape, np.float32)
+    ratio = scaled_log_rmse(found, LIGHT) / scaled_log_rmse(LEFT(found), LIGHT)
+    assert light_gains(found, LIGHT)["if_mirrored"] == pytest.approx(20 * np.log10(ratio), abs=0.01)
+    assert 3 < light_gains(found, LIGHT)["if_mirrored"] < MOST_DB - 1
 
 
 @pytest.mark.parametrize("by", SHIFTS)
