@@ -64,6 +64,11 @@ def test_memory_is_the_least_that_is_allowed(machine: Path, files: dict[str, obj
 def test_too_much_memory_is_told_with_numbers_that_differ(machine: Path) -> None:
     assert memory_excess(8 * GIB) is None
     assert memory_excess(8 * GIB + 1) == "would take about 8.1 GiB of memory, and this machine has 8.0 GiB for it"
+    write(machine, {"cgroup": "0::/", "groups/memory.max": 4 * GIB + GIB // 16})
+    assert memory_excess(memory_bytes() + 1) == (
+        "would take about 4.1 GiB of memory, and this machine has 4.0 GiB for it"
+    )
+    (machine / "cgroup").unlink()
     assert memory_excess(8000 * GIB + 1) == "would take about 8,001 GiB of memory, and this machine has 8 GiB for it"
 
 
