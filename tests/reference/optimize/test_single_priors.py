@@ -52,6 +52,13 @@ def test_an_albedo_costs_by_pixel_and_by_step_and_less_where_it_is_covered_less(
     assert albedo_cost(np.array([0.0, 0, 1]), bright, whole) == pytest.approx(own + step, rel=0.01)
 
 
+def test_one_colour_is_no_crossing_and_a_crossing_is_one_between_its_two_pixels() -> None:
+    red, green, whole = [0.8, 0.2, 0.1], [0.1, 0.6, 0.2], np.ones((3, 1))
+    own, step = PRIORS.albedo**-2, PRIORS.albedo_step**-2
+    assert albedo_cost(np.array([0.0, 0, 1]), np.array([red] * 3), whole) == pytest.approx(own + step)
+    assert albedo_cost(np.array([0.0, 0, 1]), np.array([green, red, red]), whole) == pytest.approx(own + step)
+
+
 def test_a_step_costs_less_where_the_picture_changes_its_colour() -> None:
     """Of a ratio of channels that is CHROMA from even, a share of 1 / e of what a crossing does not leave anyway."""
     away = CHROMA / np.sqrt(2) * np.array([1, -1, 0])
@@ -89,6 +96,18 @@ def test_a_direction_of_light_has_its_own_width_where_nothing_ties_it() -> None:
         assert np.array([1, -1, 0]) @ found @ np.array([1, -1, 0]) / 2 == pytest.approx(
             area / loose.light_chroma**2, rel=0.02
         )
+
+
+def test_a_light_is_tied_to_its_neighbours_and_its_colour_by_less() -> None:
+    """One direction that differs, near the horizon: from two in its row and two in its column."""
+    precision = light_precision(PRIORS).reshape(3, *LIGHT_GRID, 3, *LIGHT_GRID)[:, 3, 5][:, :, 3, 5]
+    steps = (2 / np.sin(3 * np.pi / 7) + np.sin(2.5 * np.pi / 7) + np.sin(3.5 * np.pi / 7)) / PRIORS.light_step**2
+    sine = np.maximum(np.sin(np.pi * np.arange(8) / 7), 0.1)
+    area = sine[3] / sine.mean()
+    assert precision.sum() == pytest.approx(area / PRIORS.light**2 + steps, rel=0.01)
+    finer = PRIORS.light / (2 * PRIORS.light_chroma)
+    tint = np.array([1, -1, 0]) / np.sqrt(2)
+    assert tint @ precision @ tint == pytest.approx(area / PRIORS.light_chroma**2 + steps * finer**2, rel=0.01)
 
 
 def test_the_coarse_light_is_interpolated() -> None:
