@@ -88,8 +88,8 @@ def test_a_gain_is_the_ratio_of_squared_errors_in_db() -> None:
     """Roughness 0.25 for 0.4 is wrong by 0.15; as its root by 0.1, a gain of 20 log10(1.5) dB; by 0.35 if inverted."""
 
     def maps(roughness: float, metallic: float | None) -> Intrinsics:
-        values = {"roughness": roughness, "metallic": metallic}
-        return Intrinsics(**{k: None if v is None else np.full((2, 2, 1), v, np.float32) for k, v in values.items()})
+        one, other = (None if v is None else np.full((2, 2, 1), v, np.float32) for v in (roughness, metallic))
+        return Intrinsics(roughness=one, metallic=other)
 
     mask = np.ones((2, 2, 1), np.float32)
     found = roughness_gains(maps(0.25, None), maps(0.4, None), mask)
