@@ -137,6 +137,8 @@ def test_split_sum_is_the_composite_where_the_surface_faces_the_viewer_and_more_
     gain = split_sum_image(facing.replace(normal=tilted)) - composite_image(facing)
     assert gain.min() >= 0
     assert gain.max() > 0.01
+    shorter = facing.replace(normal=0.5 * tilted)  # as averages are
+    np.testing.assert_allclose(split_sum_image(shorter), split_sum_image(facing.replace(normal=tilted)), rtol=1e-5)
 
 
 def test_split_sum_uses_the_true_view_rays() -> None:
@@ -158,6 +160,7 @@ def test_split_sum_of_a_large_picture_is_that_of_its_pixels_in_little_memory(mon
     maps["mask"] = np.where(maps["mask"] < 0.3, 0, maps["mask"])
     large = Intrinsics(normal=normal, **maps)
     whole, needed = split_sum_image(large), peak_memory(large)
+    assert not whole[maps["mask"][..., 0] == 0].any()
     monkeypatch.setattr("unirender.composite.BLOCK", 2**12)
     np.testing.assert_array_equal(split_sum_image(large), whole)
     assert peak_memory(large) < 0.5 * needed

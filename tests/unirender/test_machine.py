@@ -4,6 +4,7 @@ import importlib.util
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from unirender.system.machine import GIB, memory_bytes, memory_excess, needs_swap, peak_bytes, unswapped_bytes
@@ -63,6 +64,12 @@ def test_memory_is_the_least_that_is_allowed(machine: Path, files: dict[str, obj
 def test_too_much_memory_is_told_with_numbers_that_differ(machine: Path) -> None:
     assert memory_excess(8 * GIB) is None
     assert memory_excess(8 * GIB + 1) == "would take about 8.1 GiB of memory, and this machine has 8.0 GiB for it"
+    write(machine, {"cgroup": "0::/", "groups/memory.max": 4 * GIB + GIB // 16})
+    assert memory_excess(memory_bytes() + 1) == (
+        "would take about 4.1 GiB of memory, and this machine has 4.0 GiB for it"
+    )
+    (machine / "cgroup").unlink()
+    assert memory_excess(8000 * GIB + 1) == "would take about 8,001 GiB of memory, and this machine has 8 GiB for it"
 
 
 @pytest.mark.parametrize(
@@ -84,6 +91,7 @@ def test_a_machine_that_does_not_count_its_memory_has_enough(monkeypatch: pytest
 
 def test_where_nobody_counts_a_process_memory_it_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
     """Windows has no module `resource`."""
-    assert 2**24 < peak_bytes() < 2**40
+    held = np.ones(2**25)  # 256 MiB
+    assert held.nbytes < peak_bytes() < memory_bytes()
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert math.isnan(peak_bytes())

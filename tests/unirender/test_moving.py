@@ -76,6 +76,15 @@ def test_a_zoom_enlarges_about_the_middle(maps: dict[str, np.ndarray]) -> None:
     assert smaller / own == pytest.approx(1 / 1.15**2, rel=0.06)
 
 
+def test_the_shift_is_of_the_frame_whatever_the_roll_and_the_zoom(maps: dict[str, np.ndarray]) -> None:
+    """Rolled and nearer first, then moved by whole pixels: two to the right, three up."""
+    roll, zoom = 0.5, 1.1
+    stays, goes = (moved(batch(maps), [Move(roll, zoom, by)]) for by in ((0.0, 0.0), (2 / SIZE, -3 / SIZE)))
+    for name in ("image", "albedo", "mask", "normal"):
+        there = stays[name].roll((-3, 2), (2, 3))
+        torch.testing.assert_close(goes[name][..., 3:-3, 2:], there[..., 3:-3, 2:], rtol=1e-4, atol=1e-4)
+
+
 def test_the_light_turns_with_the_object(maps: dict[str, np.ndarray]) -> None:
     """d of the rolled object is what its rolled normals receive from the rolled light, and not from the old one."""
     after = moved(batch(maps), [Move(0.6, 1.0, (0.0, 0.0))])

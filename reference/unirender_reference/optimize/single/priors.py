@@ -60,7 +60,7 @@ def light_precision(priors: Priors) -> Float[np.ndarray, "c c"]:
 
 
 def level_freed(precision: Float[np.ndarray, "c c"], level: float) -> Float[np.ndarray, "c c"]:
-    """The precision of x + level z 1, where x has the given one but for its mean, which is fixed, and z is normal."""
+    """The precision of x + level z 1, where x has the given one and z is a standard normal number."""
     ones = precision.sum(axis=1)
     total = ones.sum()
     return precision - np.outer(ones, ones) / total * (1 - 1 / (1 + level**2 * total))
