@@ -220,6 +220,12 @@ def test_a_quadrangle_of_two_materials_is_the_first_one(tmp_path, back):
     assert load_mesh(path).provenance["double_faces"] == ("2" if back == "f 1 4 3 2" else "0"), "a bent one is two"
 
 
+def test_maps_that_say_how_a_surface_shines_are_listed(tmp_path):
+    """What Blender writes roughness and metallic into without its PBR keywords, and packed maps by their own name."""
+    maps = "map_Ks s.png\nmap_Ns n.png\nrefl -type sphere r.png\nmap_RMA p.png\nmap_Ka a.png\nmap_aat on"
+    assert write(tmp_path, maps).provenance["ignored"] == "gloss, map_rma, reflection, specular"
+
+
 def test_faces_without_texture_coordinates_leave_the_others_theirs(tmp_path):
     """One face without `vt` made the texture of the whole material its mean."""
     (tmp_path / "a.png").write_bytes(png(random_pixels(1, 4, 4)))
