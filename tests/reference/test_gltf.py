@@ -620,6 +620,19 @@ def test_what_is_scaled_to_nothing_takes_no_room(tmp_path):
     assert len(load_mesh(quad_glb(tmp_path, lambda w: two(w, [1, 1, 0]))).faces) == 4
 
 
+@pytest.mark.parametrize("normalized", [False, True])
+def test_colors_that_are_bytes_are_of_255(tmp_path, normalized):
+    """Also where their accessor does not say `normalized`, which the specification asks for: 51 is no white."""
+
+    def fill(w: GltfWriter) -> None:
+        quad = w.quad(None)
+        quad["attributes"]["COLOR_0"] = w.accessor(np.tile(np.array([[51, 0, 255, 255]], np.uint8), (4, 1)), normalized)
+        w.mesh(quad)
+
+    albedo = load_mesh(quad_glb(tmp_path, fill)).albedo.reshape(-1, 3)
+    assert albedo == pytest.approx(np.tile([0.2, 0, 1], (len(albedo), 1)), abs=1e-6)
+
+
 @pytest.mark.parametrize("normals", [False, True])
 def test_morph_targets_move_by_their_weights(tmp_path, normals):
     """By those of the node, which go before the mesh's; without normals of the file the moved faces are flat."""
