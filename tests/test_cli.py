@@ -204,6 +204,13 @@ def test_render_says_which_maps_it_was_not_given(tmp_path: Path, capsys: pytest.
     np.testing.assert_array_equal(read_result(tmp_path / "out").require("mask")["mask"], mask)
 
 
+def test_render_of_a_folder_without_maps_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """What OpenEXR prints of a missing file by itself counts, too."""
+    assert run("render", tmp_path, "--output", tmp_path / "out") == 1
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line.endswith("has no intrinsics.exr, expected the output folder of `unirender decompose`")
+
+
 def test_render_says_where_normals_face_away(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     normal, mask, _ = gutter()
     maps = as_maps(normal, mask).replace(metallic=0 * mask)

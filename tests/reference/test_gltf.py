@@ -572,8 +572,100 @@ def test_what_a_picture_lost_is_listed(tmp_path):
     assert textured_quad(tmp_path, (8, 8), texcoord=3).provenance["ignored"] == "textures of faces without coordinates"
 
 
-def test_instances_of_an_extension_are_listed(tmp_path):
-    instances = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}
-    obj = textured_quad(tmp_path, (8, 8), extensions=instances)
-    assert obj.provenance["ignored"] == "mesh_gpu_instancing"
-    assert len(obj.faces) == 2
+def test_instances_stand_where_nodes_would(tmp_path):
+    """Turned, mirrored and stretched instances, of a node that is so, against a matrix for each."""
+    quad = CORNERS + np.array([[0, 0, 0], [0, 0, 0.3], [0, 0, 0], [0.5, 0, 0]], np.float32)
+    shift = np.array([[0, 0, 0], [3, 1, 0], [0, 2, -4]], np.float32)
+    turn = np.array([[0, 0, 0, 32767], [0, 32767, 0, 0], [23170, 0, 0, 23170]], np.int16)
+    stretch = np.array([[1, 1, 1], [2, 1, -1], [1, 0.5, 3]], np.float32)
+    above = affine([1, 2, 3], Rotation.from_euler("xyz", [0.3, 0.5, 0.1]).as_quat(), [1, 2, 1])
+
+    def nodes(w: GltfWriter) -> None:
+        w.json["meshes"] = [{"primitives": [w.quad(None, quad)]}]
+        matrices = [above @ affine(*own) for own in zip(shift, turn, stretch, strict=True)]
+        w.json["nodes"] = [{"mesh": 0, "matrix": matrix.T.ravel().tolist()} for matrix in matrices]
+
+    def instances(w: GltfWriter, count: int = 3) -> None:
+        values = {"TRANSLATION": w.accessor(shift[:count]), "ROTATION": w.accessor(turn, normalized=True)}
+        extension = {"EXT_mesh_gpu_instancing": {"attributes": values | {"SCALE": w.accessor(stretch)}}}
+        w.mesh(w.quad(None, quad), matrix=above.T.ravel().tolist(), extensions=extension)
+
+    expected = load_mesh(quad_glb(tmp_path, nodes))
+    obj = load_mesh(quad_glb(tmp_path, instances, ["EXT_mesh_gpu_instancing"]))
+    assert len(obj.faces) == 6
+    assert obj.vertices[obj.faces] == pytest.approx(expected.vertices[expected.faces], abs=2e-4)
+    assert obj.normals[obj.faces] == pytest.approx(expected.normals[expected.faces], abs=2e-4)
+    assert obj.provenance["ignored"] == ""
+    with pytest.raises(UnirenderError, match="ROTATION of its instances is 3 times 4, expected 2 times 4"):
+        load_mesh(quad_glb(tmp_path, lambda w: instances(w, count=2)))
+
+
+def affine(translation, quaternion, scale) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(quaternion).as_matrix() * scale
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def test_what_is_scaled_to_nothing_takes_no_room(tmp_path):
+    """glTF 2.0, 3.5.3: a mesh is hidden so. One scaled to a plane is not."""
+
+    def two(w: GltfWriter, scale: list[int]) -> None:
+        w.mesh(w.quad(None))
+        w.mesh(w.quad(None), translation=[0, 100, 0], scale=scale)
+
+    alone = load_mesh(quad_glb(tmp_path, lambda w: w.mesh(w.quad(None))))
+    hidden = load_mesh(quad_glb(tmp_path, lambda w: two(w, [0, 0, 0])))
+    assert hidden.vertices == pytest.approx(alone.vertices, abs=1e-6)
+    assert len(load_mesh(quad_glb(tmp_path, lambda w: two(w, [1, 1, 0]))).faces) == 4
+
+
+@pytest.mark.parametrize("normalized", [False, True])
+def test_colors_that_are_bytes_are_of_255(tmp_path, normalized):
+    """Also where their accessor does not say `normalized`, which the specification asks for: 51 is no white."""
+
+    def fill(w: GltfWriter) -> None:
+        quad = w.quad(None)
+        quad["attributes"]["COLOR_0"] = w.accessor(np.tile(np.array([[51, 0, 255, 255]], np.uint8), (4, 1)), normalized)
+        w.mesh(quad)
+
+    albedo = load_mesh(quad_glb(tmp_path, fill)).albedo.reshape(-1, 3)
+    assert albedo == pytest.approx(np.tile([0.2, 0, 1], (len(albedo), 1)), abs=1e-6)
+
+
+@pytest.mark.parametrize("normals", [False, True])
+def test_morph_targets_move_by_their_weights(tmp_path, normals):
+    """By those of the node, which go before the mesh's; without normals of the file the moved faces are flat."""
+    first, second = np.zeros((4, 3), np.float32), np.zeros((4, 3), np.float32)
+    first[2] = [0.5, 0, 2]
+    second[3] = [0, 0, -1]
+    leaning = np.tile(np.array([0.3, 0, 0], np.float32), (4, 1))
+    up = np.tile(np.array([0, 0, 1], np.float32), (4, 1))
+
+    def morphed(w: GltfWriter, of_mesh: list[float], **node: Any) -> None:
+        quad = w.quad(None)
+        quad["targets"] = [{"POSITION": w.accessor(first)}, {"POSITION": w.accessor(second)}]
+        if normals:
+            quad["attributes"]["NORMAL"] = w.accessor(up)
+            quad["targets"][0]["NORMAL"] = w.accessor(leaning)
+        w.mesh(quad, **node)
+        w.json["meshes"][0]["weights"] = of_mesh
+
+    def moved(w: GltfWriter, a: float, b: float) -> None:
+        quad = w.quad(None, CORNERS + np.float32(a) * first + np.float32(b) * second)
+        if normals:
+            quad["attributes"]["NORMAL"] = w.accessor(up + np.float32(a) * leaning)
+        w.mesh(quad)
+
+    for of_mesh, node, result in (
+        ([0.0, 0.0], {}, (0, 0)),
+        ([0.5, 0.25], {}, (0.5, 0.25)),
+        ([1.0, 1.0], {"weights": [0, -0.5]}, (0, -0.5)),
+    ):
+        obj = load_mesh(quad_glb(tmp_path, lambda w, of_mesh=of_mesh, node=node: morphed(w, of_mesh, **node)))
+        expected = load_mesh(quad_glb(tmp_path, lambda w, result=result: moved(w, *result)))
+        assert obj.vertices[obj.faces] == pytest.approx(expected.vertices[expected.faces], abs=1e-6)
+        assert obj.normals[obj.faces] == pytest.approx(expected.normals[expected.faces], abs=1e-6)
+        assert obj.provenance["ignored"] == ""
+    with pytest.raises(UnirenderError, match="has 2 morph targets and 3 weights, expected one for each"):
+        load_mesh(quad_glb(tmp_path, lambda w: morphed(w, [0.0, 0.0, 1.0])))

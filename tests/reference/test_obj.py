@@ -203,6 +203,29 @@ def test_faces_on_each_other_are_one(tmp_path):
     assert obj.normals == pytest.approx(np.tile([0, 0, 1], (len(obj.normals), 1)))
 
 
+@pytest.mark.parametrize("back", ["f 4 3 2 1", "f 1 4 3 2", "f 4 3 2\nf 4 2 1"])
+def test_a_quadrangle_of_two_materials_is_the_first_one(tmp_path, back):
+    """Front and back as modelling programs write them, whichever diagonals they are cut along."""
+    (tmp_path / "m.mtl").write_text("newmtl front\nKd 1 0 0\nnewmtl back\nKd 0 0 1\n")
+    lines = ["mtllib m.mtl", "v -1 -1 0", "v 1 -1 0.5", "v 1 1 0.5", "v -1 1 0", "v 0 0 2"]
+    path = tmp_path / "m.obj"
+    path.write_text("\n".join([*lines, "usemtl front", "f 1 2 3 4", "usemtl back", back, ""]))
+    obj = load_mesh(path)
+    assert obj.provenance["double_faces"] == "2"
+    assert obj.albedo == pytest.approx([1, 0, 0])
+    path.write_text("\n".join([*lines, "usemtl front", "f 1 2 3 4", "usemtl back", "f 2 3 4", "f 4 2 5", ""]))
+    assert load_mesh(path).provenance["double_faces"] == "0", "one half alone is no double"
+    bent = "\n".join([*lines, "usemtl front", "f 1 2 3 4", "usemtl back", back, ""]).replace("v -1 1 0", "v -1 1 0.1")
+    path.write_text(bent)
+    assert load_mesh(path).provenance["double_faces"] == ("2" if back == "f 1 4 3 2" else "0"), "a bent one is two"
+
+
+def test_maps_that_say_how_a_surface_shines_are_listed(tmp_path):
+    """What Blender writes roughness and metallic into without its PBR keywords, and packed maps by their own name."""
+    maps = "map_Ks s.png\nmap_Ns n.png\nrefl -type sphere r.png\nmap_RMA p.png\nmap_Ka a.png\nmap_aat on"
+    assert write(tmp_path, maps).provenance["ignored"] == "gloss, map_rma, reflection, specular"
+
+
 def test_faces_without_texture_coordinates_leave_the_others_theirs(tmp_path):
     """One face without `vt` made the texture of the whole material its mean."""
     (tmp_path / "a.png").write_bytes(png(random_pixels(1, 4, 4)))

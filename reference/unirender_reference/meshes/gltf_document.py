@@ -12,6 +12,7 @@ from unirender_reference.meshes.folder import ModelFolder
 from unirender_reference.meshes.limits import MAX_TEXT_BYTES, check_bytes
 
 READABLE = {
+    "EXT_mesh_gpu_instancing",
     "KHR_draco_mesh_compression",
     "KHR_materials_pbrSpecularGlossiness",
     "KHR_mesh_quantization",
@@ -21,7 +22,6 @@ READABLE = {
     "EXT_texture_webp",
 }
 ADVICE = {  # by extension that is not read: what to do; of others the file is to be exported without them
-    "EXT_mesh_gpu_instancing": "export each instance as a node",
     "EXT_meshopt_compression": "export it without compression, or with Draco",
     "KHR_meshopt_compression": "export it without compression, or with Draco",
     "KHR_texture_basisu": "export its textures as PNG or JPEG",

@@ -27,7 +27,9 @@ UNHEEDED = {"-mm": (0.0, 1.0), "-t": (0.0, 0.0, 0.0)}  # options that would chan
 COLOURED = 0.1  # mean difference of the channels, from which a picture is no grey one
 MAPS = {"map_kd": "albedo", "map_pr": "roughness", "map_pm": "metallic", "norm": "normal"}
 IGNORED = {"map_d": "alpha", "map_bump": "bump", "bump": "bump", "map_ke": "emission", "disp": "displacement"}
-IGNORED |= {"map_pc": "clearcoat", "map_ps": "sheen"}
+IGNORED |= {"map_pc": "clearcoat", "map_ps": "sheen", "map_ks": "specular", "map_ns": "gloss"}
+IGNORED |= {"refl": "reflection", "map_refl": "reflection"}
+NO_LOSS = ("map_ka", "map_aat")  # of ambient light, which a render has none of, and antialiasing
 BEYOND = {"ke": "emission", "pc": "clearcoat", "ps": "sheen", "aniso": "anisotropy"}  # numbers, ignored where not 0
 
 
@@ -57,8 +59,8 @@ def parse_mtl(text: str) -> dict[str, MtlEntry]:
             check_materials(len(entries))
         elif keyword in MAPS:
             entry.maps[MAPS[keyword]] = _map(rest)
-        elif keyword in IGNORED:
-            entry.ignored.add(IGNORED[keyword])
+        elif keyword in IGNORED or (keyword.startswith("map_") and keyword not in NO_LOSS):
+            entry.ignored.add(IGNORED.get(keyword, keyword))
         elif keyword in ("kd", "pr", "pm", "d", "tr", *BEYOND):
             try:
                 entry.numbers[keyword] = [float(value) for value in rest.split()]

@@ -163,6 +163,8 @@ class Render:
         from unirender.files import ENVIRONMENT_FILE, INTRINSICS_FILE
 
         file = self.maps / INTRINSICS_FILE if self.maps.is_dir() else self.maps
+        if not file.is_file():  # told by what reads the maps; OpenEXR would print a line of its own
+            return {}
         lit = self.maps.is_dir() and (self.maps / ENVIRONMENT_FILE).exists()
         derived = self.environment is not None or (lit and not {"specular.R", "diffuse.R"} <= channel_names(file))
         taken = DERIVED_BYTES_A_PIXEL if derived else RENDERED_BYTES_A_PIXEL
