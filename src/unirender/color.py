@@ -74,7 +74,8 @@ def display_slope(
 def unpremultiply(
     image_linear: Float[np.ndarray, "*batch h w c"], mask: Float[np.ndarray, "*batch h w 1"]
 ) -> Float[np.ndarray, "*batch h w c"]:
-    """Radiance of the covered part of each pixel: a premultiplied image / its coverage; 0 where the mask is 0.
+    """Radiance of the covered part of each pixel: a premultiplied image / its coverage; 0 where the mask is 0,
+    and NaN where the mask is.
 
     Raises:
         UnirenderError: one of them is of whole numbers (a mask of 0 and 1 may be), or the mask has not one channel.
@@ -88,7 +89,7 @@ def unpremultiply(
 
 
 def _straight(image_linear: Float[np.ndarray, "..."], mask: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    return np.where(mask > 0, image_linear / np.maximum(mask, MIN_MASK), 0).astype(np.float32)
+    return np.where(mask <= 0, 0, image_linear / np.maximum(mask, MIN_MASK)).astype(np.float32)
 
 
 def luminance(rgb_linear: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "..."]:

@@ -18,9 +18,9 @@ from jaxtyping import Float
 from unirender.arguments import as_instance, as_path
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender.intrinsics import IMAGE_MAPS, Intrinsics
+from unirender.intrinsics import IMAGE_MAPS, Intrinsics, as_numbers
 from unirender.picture_files.primaries import in_rec709
-from unirender.system.whole_files import replace_file
+from unirender.system.whole_files import is_special, replace_file
 
 Channels = dict[str, Float[np.ndarray, "h w"]]
 
@@ -56,7 +56,8 @@ def write_exr(
         attributes: provenance; keys get the prefix `unirender:`.
 
     Raises:
-        UnirenderError: shapes differ, a value is not finite, or it does not fit into half precision.
+        UnirenderError: shapes differ or are empty, a name is no text, or a value is no number, not finite, or does not
+            fit into half precision.
         OSError: it cannot be written; what was there stays.
     """
     replace_file(as_path(path), exr_bytes(channels, half=half, attributes=attributes))
@@ -104,11 +105,14 @@ def exr_bytes(
     """The bytes of an EXR file; arguments and errors as `write_exr`."""
     as_instance(channels, Mapping, "EXR channels")
     shapes = {name: np.shape(value) for name, value in channels.items()}
-    if not channels or len(set(shapes.values())) != 1 or len(next(iter(shapes.values()))) != 2:
+    common = next(iter(shapes.values()), ())
+    if set(shapes.values()) != {common} or len(common) != 2 or 0 in common:
         raise UnirenderError(f"EXR channels: got shapes {shapes}, expected one common [height, width]")
+    if unnamed := [name for name in channels if not isinstance(name, str) or not name]:
+        raise UnirenderError(f"EXR channels: got the names {', '.join(map(repr, unnamed))}, expected text")
     stored = {}
     for name, value in channels.items():
-        value = np.asarray(value, dtype=np.float32)
+        value = as_numbers(f"EXR channel {name}", value)
         if not np.isfinite(value).all():
             raise UnirenderError(f"EXR channel {name}: got NaN or infinity, expected finite values")
         if half and np.abs(value).max(initial=0.0) > HALF_MAX:
@@ -132,10 +136,12 @@ def read_exr(path: str | Path) -> tuple[Channels, dict[str, str]]:
     Colours of a file that states other primaries come in Rec.709 (`unirender.picture_files.primaries`).
 
     Raises:
-        UnirenderError: the file is missing, is no readable single-part OpenEXR, or stores pixels of another part
+        UnirenderError: the file is missing, a pipe, no readable single-part OpenEXR, or stores pixels of another part
             than its picture.
     """
     path = as_path(path)
+    if is_special(path):  # which would wait for who writes to it, or never end
+        raise UnirenderError(f"{path}: is a pipe or a device, expected an OpenEXR file; save it as a file first")
     try:
         data = path.read_bytes()
     except OSError as error:

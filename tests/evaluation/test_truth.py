@@ -197,7 +197,7 @@ def test_the_generator_makes_a_suite_resumes_and_repeats_itself(tmp_path: Path) 
         text = re.sub(rf"^{name} = .*$", f"{name} = {value}", text, flags=re.MULTILINE)
     path = tmp_path / "mini.toml"
     path.write_text(text)
-    assert list(make_truth(path, tmp_path / "work", workers=1)) == [(1, 1)]
+    assert list(make_truth(path, tmp_path / "work", workers=10**12)) == [(1, 1)]
     suite, first = load_suite(path), (tmp_path / "mini.tar").read_bytes()
     assert recorded(suite.spec).items() <= suite.provenance.items()
     kinds = quality_summary(suite)

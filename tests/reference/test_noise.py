@@ -260,13 +260,18 @@ class Here(Inline):
         pass
 
 
-@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("workers", [1, 10**12])
 @pytest.mark.parametrize("reaching", [(0, 1, 2), (1, 5, 6), (12, 13, 14), (14,), ()])
 def test_images_are_drawn_until_enough_are_measured_or_none_is_left(
     reaching: tuple[int, ...], workers: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of 15 candidates for 3 images those that reach the floor, the last of all included, and the ones before them."""
-    monkeypatch.setattr(noise_floor, "WorkerPool", lambda *options: Here())
+
+    def pool(count: int, start: Callable[[], None]) -> Here:
+        assert count == min(workers, 3)  # no more than images
+        return Here()
+
+    monkeypatch.setattr(noise_floor, "WorkerPool", pool)
     monkeypatch.setattr(
         noise_floor, "measure_floor", lambda job: measured_row(job.number, 45, 45 if job.number in reaching else None)
     )

@@ -72,3 +72,5 @@ def test_unpremultiply_undoes_coverage_and_leaves_the_background_black() -> None
     assert not straight[:2].any()
     assert np.abs(colour_linear * mask - colour_linear)[2:].max() > 0.1  # twin: left premultiplied
     assert not unpremultiply(colour_linear, mask)[:2].any()  # a glow around the object has no coverage
+    mask[3, 0] = np.nan
+    assert np.isnan(unpremultiply(colour_linear, mask)).sum() == 3  # what is not known is not black

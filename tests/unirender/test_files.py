@@ -82,6 +82,9 @@ def test_radiance_of_any_scale_is_stored(tmp_path: Path, scale: float, half: boo
         ({}, r"expected one common \[height, width\]"),
         ({"R": np.zeros((2, 2)), "G": np.zeros((2, 3))}, "expected one common"),
         ({"R": np.zeros((2, 2, 1))}, "expected one common"),
+        ({"R": np.zeros((0, 2))}, "expected one common"),
+        ({"": np.zeros((2, 2))}, "EXR channels: got the names '', expected text"),
+        ({"R": np.full((1, 1), 1j)}, "EXR channel R: got ndarray .* expected numbers"),
         ({"R": np.array([[0, np.nan]])}, "EXR channel R: got NaN or infinity"),
         ({"R": np.array([[0, np.inf]])}, "EXR channel R: got NaN or infinity"),
         ({"R": np.array([[0, 65600.0]])}, "got 6.56e"),
@@ -321,6 +324,27 @@ def test_a_file_is_replaced_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         replace_file(path, "newer")
     assert path.read_bytes() == b"new"
     assert [file.name for file in path.parent.iterdir()] == ["file"]
+
+
+def test_what_is_no_plain_file_is_not_replaced_by_one(tmp_path: Path) -> None:
+    """As root, `/dev/null` itself became a file."""
+    pipe, link, file = tmp_path / "pipe", tmp_path / "link.exr", tmp_path / "elsewhere" / "file.exr"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    replace_file(pipe, "said")
+    assert os.read(reader, 100) == b"said"
+    os.close(reader)
+    assert pipe.is_fifo()
+    link.symlink_to(file)
+    for _ in range(2):  # before there is such a file, and after
+        write_exr(link, {"Y": np.ones((2, 2), np.float32)})
+        assert link.is_symlink()
+        assert not file.is_symlink()
+        assert read_exr(file)[0]["Y"].all()
+    for folder in (tmp_path, Path(""), Path("/")):
+        with pytest.raises(IsADirectoryError):
+            replace_file(folder, "a")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["elsewhere", "link.exr", "pipe"]
 
 
 def test_a_stream_that_breaks_leaves_what_was_there_and_nothing_aside(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from unirender.files import map_picture, read_result, write_png, write_result
 from unirender.intrinsics import Intrinsics
 from unirender.pictures import read_picture
 from PIL import Image
-from unirender.light.environment import resample_environment, rotate_environment, sample_environment
+from unirender.light.environment import has_bright_pole, resample_environment, rotate_environment, sample_environment
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.scene_export import export_scene
 from unirender.light.surface_light import diffuse_light, specular_light
@@ -144,6 +144,7 @@ CASES = {
     "renderer.obj.turned(np.eye(4))": "train-000001: got [[1.0, 0.0, 0.0, 0.0], ",
     "View(image, mask, 36, np.eye(4))": "view: got camera 36, expected a unirender.camera.Camera",
     "View([1], mask, Camera(), np.eye(4))": "view: got image (1,), mask (16, 24, 1); expected (h, w, 3) and (h, w, 1)",
+    "has_bright_pole(light[..., :2])": "environment: got shape (16, 32, 2), expected a lat-long map",
     "resample_environment(light, 16)": "environment: got size 16, expected a lat-long map of at least 2 x 2 texels",
     "shade(maps, photograph)": "environment: got Image of uint8 values, expected linear radiance as floats; read a",
     "shade_gradients(maps, image, bytes_8)": "environment: got ndarray of uint8 values, expected linear radiance as",

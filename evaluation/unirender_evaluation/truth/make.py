@@ -134,7 +134,7 @@ def _rendered(jobs: Sequence[ObjectJob], workers: int) -> Generator[tuple[int, P
     Raises:
         UnirenderError: a worker process died.
     """
-    with WorkerPool(workers, start_worker) as pool:
+    with WorkerPool(min(workers, max(len(jobs), 1)), start_worker) as pool:
         numbers = {pool.submit(render_object, job): number for number, job in enumerate(jobs)}
         try:
             for future in as_completed(numbers):

@@ -1,6 +1,7 @@
 """`unirender reference census`: NaN, infinite and negative pixels over random scenes, as tables."""
 
 import json
+import math
 import os
 from collections import Counter
 from dataclasses import asdict, dataclass
@@ -45,9 +46,9 @@ class Census:
         if self.json is not None and not self.json.absolute().parent.is_dir():
             raise UsageError(f"--json: got {self.json}, expected a file in an existing folder")
         check_file("--json", self.json)
-        from unirender_reference.measure.census import KINDS, run_census, timed
+        from unirender_reference.measure.census import KINDS, RENDERS_PER_OBJECT, run_census, timed
 
-        workers = self.workers or os.cpu_count() or 1
+        workers = min(self.workers or os.cpu_count() or 1, math.ceil(self.renders / RENDERS_PER_OBJECT))
         censuses, seconds = timed(run_census(self.renders, self.resolution, self.spp, self.seed, workers))
         bad = [pixel for census in censuses for pixel in census.bad]
         written = sum(census.written for census in censuses)

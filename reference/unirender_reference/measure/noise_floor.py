@@ -158,7 +158,7 @@ class NoiseFloor:
         """Rows in the order of their numbers, until enough are measured or all candidates have been tried."""
         from concurrent.futures import Future
 
-        workers = self.workers or os.cpu_count() or 1
+        workers = min(self.workers or os.cpu_count() or 1, self.images)
         jobs = (
             FloorJob(self.seed + i, self.floor, self.factor, self.resolution, self.limit)
             for i in range(MOST_SKIPPED * self.images)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from unirender.command_line.writing import unusable, writing
 from unirender.errors import UnirenderError
+from unirender.system.whole_files import is_special
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -30,7 +31,7 @@ def check_file(option: str, path: Path | None) -> None:
     Raises:
         UnirenderError: it cannot.
     """
-    if path is None or _is_special(path):
+    if path is None or is_special(path):
         return
     if path.is_dir():
         raise UnirenderError(f"{option} {path}: is a folder, expected the name of a file")
@@ -47,11 +48,7 @@ def write_file(option: str, path: Path, content: str | bytes) -> None:
     from unirender.system.whole_files import replace_file
 
     with writing(f"{option} {path}", ELSEWHERE):
-        if _is_special(path):
-            with path.open("wb") as file:
-                file.write(content if isinstance(content, bytes) else content.encode())
-        else:
-            replace_file(path.resolve(), content)
+        replace_file(path, content)
 
 
 def png_bytes(sheet: "Image.Image") -> bytes:
@@ -76,7 +73,3 @@ def full_disk(folder: Path) -> Iterator[None]:
         raise UnirenderError(
             f"{folder}: cannot be written ({error.strerror}); free some space and run the same command again to go on"
         ) from error
-
-
-def _is_special(path: Path) -> bool:
-    return path.exists() and not path.is_file() and not path.is_dir()

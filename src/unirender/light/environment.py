@@ -153,7 +153,11 @@ def has_bright_pole(environment: Float[np.ndarray, "h w 3"]) -> bool:
     where the rows beside them draw it. Where those are dark, most samples miss it and a few count for all. A sample
     that meets a texel counts about as often too much as the texel is brighter than the one beside it (the contrast);
     the texels' mean contrast, by their share of the light's power, is therefore the variance that they bring.
+
+    Raises:
+        UnirenderError: it is no lat-long map.
     """
+    check_map(environment)
     brightness = luminance(environment).astype(np.float64)
     power = brightness * texel_solid_angles(*environment.shape[:2])
     noise, total = 0.0, max(float(power.sum()), 1e-300)

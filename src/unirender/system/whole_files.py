@@ -1,6 +1,7 @@
 """Files and folders that are there whole or not at all, whatever stops the process that writes them."""
 
 import contextlib
+import errno
 import hashlib
 import os
 import secrets
@@ -17,15 +18,28 @@ def replace_file(path: Path, content: str | bytes) -> Path:
     """Writes a file, text as UTF-8, and its folder where there is none; returns the path.
 
     It is written aside, synced and renamed: whoever reads `path`, after a crash or while others write it too, finds the
-    old content or the new.
+    old content or the new. A link stays, and the file that it leads to is the one that is written. A device or a pipe,
+    such as `/dev/stdout`, is written to as it is.
 
     Raises:
         OSError: it cannot be written; what was there stays.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with _renamed(path, aside(path, "partial"), "xb") as file:
-        file.write(content if isinstance(content, bytes) else content.encode())
+    data = content if isinstance(content, bytes) else content.encode()
+    if is_special(path):
+        path.write_bytes(data)
+        return path
+    place = path.resolve()
+    if place.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with _renamed(place, aside(place, "partial"), "xb") as file:
+        file.write(data)
     return path
+
+
+def is_special(path: Path) -> bool:
+    """Whether it is a device or a pipe."""
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def aside(path: Path, ending: str) -> Path:
