@@ -697,6 +697,18 @@ def test_doctor_finds_what_does_not_work(
     assert run("doctor") == 1
 
 
+def test_doctor_shows_all_of_a_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """However long it is: it is folded, and brackets are no markup."""
+    monkeypatch.setattr("unirender_reference.backend.doctor", lambda: [("kernel", "sum(0..4) = 10", "ok")])
+    cache = tmp_path / "[old]" / ("long-" * 20)
+    monkeypatch.setenv("UNIRENDER_CACHE", str(cache))
+    assert run("doctor") == 0
+    cells = [line.split("│")[2].strip() for line in capsys.readouterr().out.splitlines() if line.count("│") == 4]
+    assert str(cache) in "".join(cells)
+
+
 def test_help_loads_nothing_heavy() -> None:
     code = (
         "import sys, unirender.cli\n"

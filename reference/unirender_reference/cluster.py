@@ -26,7 +26,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from unirender.errors import UnirenderError
+from unirender.errors import UnirenderError, UsageError
 from unirender_reference import backend
 from unirender_reference.denoise import PACKAGE as DENOISER
 from unirender_reference.workers import WorkerDied
@@ -119,10 +119,24 @@ class ClusterExecutor:
 
 
 def check_address(address: str) -> None:
-    """Raises `UnirenderError` unless `connect` understands the address."""
+    """Raises `UsageError` unless `connect` understands the address."""
     if not (SLURM if address.startswith("slurm") else SCHEDULER).fullmatch(address):
+        raise UsageError(f"cluster: got {address!r}, expected tcp://host:port of a dask scheduler, slurm or slurm:JOBS")
+
+
+def check_machine(address: str) -> None:
+    """Raises `UnirenderError` where this machine lacks what `connect` needs, before anybody is asked for an answer."""
+    _require("distributed")
+    if not SLURM.fullmatch(address):
+        return
+    _require("dask_jobqueue")
+    if shutil.which("sbatch") is None:
+        raise UnirenderError("cluster slurm: no `sbatch` here; run the command on a login node of the Slurm cluster")
+    options = _slurm_options()
+    if not options["cores"] or not options["memory"]:
         raise UnirenderError(
-            f"cluster: got {address!r}, expected tcp://host:port of a dask scheduler, slurm or slurm:JOBS"
+            "cluster slurm: cores and memory of a job are not set; write them to ~/.config/dask/jobqueue.yaml: "
+            "jobqueue: {slurm: {cores: 32, memory: 64GB, walltime: '04:00:00', queue: NAME}}"
         )
 
 
@@ -139,7 +153,7 @@ def connect(address: str, timeout: float = TIMEOUT, denoise: bool = False) -> It
         UnirenderError: dask is not installed, nobody answers, there are no workers, or they are not like this process.
     """
     check_address(address)
-    _require("distributed")
+    check_machine(address)
     from distributed import Client
 
     with contextlib.ExitStack() as stack:
@@ -175,18 +189,9 @@ def _start_slurm(jobs: int, stack: contextlib.ExitStack) -> tuple[Any, int]:
     Returns:
         The cluster and how many processes it will have.
     """
-    _require("dask_jobqueue")
-    if shutil.which("sbatch") is None:
-        raise UnirenderError("cluster slurm: no `sbatch` here; run the command on a login node of the Slurm cluster")
-    from dask import config as dask_config
     from dask_jobqueue.slurm import SLURMCluster
 
-    options = dask_config.get("jobqueue.slurm")
-    if not options["cores"] or not options["memory"]:
-        raise UnirenderError(
-            "cluster slurm: cores and memory of a job are not set; write them to ~/.config/dask/jobqueue.yaml: "
-            "jobqueue: {slurm: {cores: 32, memory: 64GB, walltime: '04:00:00', queue: NAME}}"
-        )
+    options = _slurm_options()
     processes = options["processes"] or options["cores"]
     cluster: Any = stack.enter_context(SLURMCluster(processes=processes))
     for _ in range(jobs):
@@ -202,6 +207,14 @@ def _start_slurm(jobs: int, stack: contextlib.ExitStack) -> tuple[Any, int]:
     cluster.adapt(minimum_jobs=jobs, maximum_jobs=jobs)
     _log.info("waiting for the first of %d Slurm jobs", jobs)
     return cluster, jobs * processes
+
+
+def _slurm_options() -> dict[str, Any]:
+    """A job's section of dask's own configuration, to which `dask_jobqueue` adds its defaults."""
+    import dask_jobqueue  # noqa: F401 - it registers them
+    from dask import config as dask_config
+
+    return dask_config.get("jobqueue.slurm")
 
 
 async def _submit(cluster: Any) -> None:

@@ -139,8 +139,7 @@ class LocalWorkers:
             self._running -= 1
             error = CancelledError() if inner.cancelled() else inner.exception()
             if isinstance(error, BrokenProcessPool):
-                self._pools.discard(pool)
-                pool.shutdown(wait=False)
+                self._pools.discard(pool)  # it ends by itself; `shutdown` would wait for a lock of this very thread
                 if alone or self._closed:
                     _fail(task, WorkerDied("the worker died, and again with nothing beside it (out of memory?)"))
                 else:

@@ -75,6 +75,7 @@ class Doctor:
         """Returns the exit status: 1 where something is missing or does not work."""
         from rich.console import Console
         from rich.table import Table
+        from rich.text import Text
 
         import unirender
         from unirender.command_line.writing import unusable
@@ -95,7 +96,7 @@ class Doctor:
         rows.append(("cache", f"{cache_dir()}{wrong if reason else ''}", "fail" if reason else "ok"))
         table = Table("what", "found", "status")
         for row in rows:
-            table.add_row(*(str(cell) for cell in row))
+            table.add_row(*(Text(str(cell), overflow="fold") for cell in row))  # paths are copied from here
         Console().print(table)
         return 1 if any(row[2] == "fail" for row in rows) else 0
 

@@ -1,6 +1,7 @@
 """`bench run --cluster` on `dask.distributed` workers, separate processes over TCP: the run of this machine alone."""
 
 import contextlib
+import importlib.util
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -15,6 +16,7 @@ from tiny_suites import make_suite, write_suite
 from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.bounds import CEILING_KEY
 from unirender_evaluation.records import Record
+from unirender_evaluation.runs import benchmark
 from unirender_evaluation.runs.benchmark import _work, prepare
 from unirender_evaluation.runs.cluster import AHEAD, Order, cluster_scene, run_on_cluster
 from unirender_evaluation.runs.command import BenchRun
@@ -184,9 +186,18 @@ def test_a_worker_that_is_not_like_this_machine_is_refused(tmp_path: Path) -> No
     ("options", "error", "message"),
     [
         ({"cluster": "tcp://here:8786", "jobs": 2}, UsageError, "--jobs 2: expected none with --cluster"),
-        ({"cluster": "somewhere"}, UnirenderError, "cluster: got 'somewhere', expected tcp://host:port"),
+        ({"cluster": "somewhere"}, UsageError, "cluster: got 'somewhere', expected tcp://host:port"),
     ],
 )
 def test_options(options: dict[str, Any], error: type[UnirenderError], message: str) -> None:
     with pytest.raises(error, match=message):
         BenchRun(**options).run()
+
+
+def test_without_dask_nothing_has_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The truth check, minutes of a suite, comes before any worker is asked for."""
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    config, _ = trivial(tmp_path)
+    with pytest.raises(UnirenderError, match=r"distributed is not installed; `pip install 'unirender\[cluster\]'`"):
+        benchmark.run(replace(config, cluster="tcp://127.0.0.1:1"))
+    assert not config.out.exists()

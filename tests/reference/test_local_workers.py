@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from unirender.errors import UnirenderError
+from unirender.worker_pool import WorkerPool
 from unirender_reference.processes import time_limit
 from unirender_reference.workers import LocalWorkers, WorkerDied
 
@@ -148,3 +149,18 @@ def test_another_thread_has_no_limit() -> None:
     thread.start()
     thread.join()
     assert reached == [True]
+
+
+def test_a_pool_is_shut_down_by_no_thread_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """That of a pool whose worker died holds the pool's lock since Python 3.12.1: it would wait for itself."""
+    genuine, by = WorkerPool.shutdown, []
+
+    def shutdown(pool: WorkerPool, **options: bool) -> None:
+        by.append(threading.current_thread() is pool._executor_manager_thread)
+        genuine(pool, **options)
+
+    monkeypatch.setattr(WorkerPool, "shutdown", shutdown)
+    with LocalWorkers(1, ready) as workers:
+        assert workers.submit(deadly, tmp_path / "log", 1).result(30) == 2
+    assert by
+    assert not any(by)

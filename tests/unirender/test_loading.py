@@ -170,10 +170,19 @@ def test_weights_that_the_network_does_not_know_are_no_reason_to_refuse(folder: 
     assert UniRenderPipeline.from_pretrained(folder).size == make_pipeline().size
 
 
-def test_what_a_setting_of_ours_says_is_said_as_it_is(folder: Path) -> None:
-    index = json.loads((folder / "model_index.json").read_text())
-    (folder / "model_index.json").write_text(json.dumps(index | {"calibration": {"albedo": [1, 0]}}))
-    with pytest.raises(UnirenderError, match=r"^calibration: got .*, expected a slope of 0 or more"):
+@pytest.mark.parametrize(
+    ("file", "option", "says"),
+    [
+        ("model_index.json", {"calibration": {"albedo": [1, 0]}}, "calibration: got .*, expected a slope of 0 or more"),
+        (CONFIG, {"physics_prior": "no"}, "physics_prior: got 'no', expected 'none' or one of: composite, split_sum"),
+    ],
+)
+def test_what_a_setting_of_ours_says_is_said_of_the_folder(
+    folder: Path, file: str, option: dict[str, object], says: str
+) -> None:
+    written = json.loads((folder / file).read_text())
+    (folder / file).write_text(json.dumps(written | option))
+    with pytest.raises(UnirenderError, match=f"mine: {says}"):
         UniRenderPipeline.from_pretrained(folder)
 
 

@@ -84,10 +84,14 @@ def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
     """Runs or continues a benchmark and writes its folder (see the module).
 
     Raises:
-        UnirenderError: unusable suite, folder, checkpoint, plug-in or predictions, or another run is writing to the
-            folder; nothing has run then. Or the folder cannot be written any more, or a method fails: a second run
-            continues from there. A failed truth check or claim is no error: the verdict says so.
+        UnirenderError: unusable suite, folder, checkpoint, plug-in or predictions, no dask for a cluster, or another
+            run is writing to the folder; nothing has run then. Or the folder cannot be written any more, or a method
+            fails: a second run continues from there. A failed truth check or claim is no error: the verdict says so.
     """
+    if config.cluster is not None:
+        from unirender_reference.cluster import check_machine
+
+        check_machine(config.cluster)
     config = anywhere(config)
     here = prepare(config)
     with made_folder(config.out), locked(config.out), writing_run(config.out):

@@ -84,6 +84,10 @@ class BenchRun:
             raise UsageError(f"--seed {self.seed}: expected an integer of 64 bits")
         if self.cluster is not None and self.jobs is not None:
             raise UsageError(f"--jobs {self.jobs}: expected none with --cluster, whose workers are its own")
+        if self.cluster is not None:
+            from unirender_reference.cluster import check_address
+
+            check_address(self.cluster)
         if not self.check_scenes and (self.recheck or self.check_seed is not None):
             option = "--recheck" if self.recheck else f"--check-seed {self.check_seed}"
             raise UsageError(f"{option}: expected none with --check-scenes 0, which renders nothing again")
@@ -106,10 +110,6 @@ class BenchRun:
         from unirender_evaluation.runs.config import BenchConfig
         from unirender_evaluation.tables.formats import print_table
 
-        if self.cluster is not None:
-            from unirender_reference.cluster import check_address
-
-            check_address(self.cluster)
         console = Console()
         config = BenchConfig(
             suite=self.suite,

@@ -96,10 +96,10 @@ class DualStreamPipeline(DiffusionPipeline):
         kwargs = {"dtype": old_name or torch.float32, "use_safetensors": True} | kwargs
         with reading(path):
             pipeline = super().from_pretrained(str(path), **kwargs)
-            check_options(pipeline, path / INDEX_FILE)
-            if "dual_stream" not in kwargs:
-                check_options(pipeline.dual_stream, path / "dual_stream" / "config.json")
-                check_complete(pipeline.dual_stream, path / "dual_stream")
+        check_options(pipeline, path / INDEX_FILE)
+        if "dual_stream" not in kwargs:
+            check_options(pipeline.dual_stream, path / "dual_stream" / "config.json")
+            check_complete(pipeline.dual_stream, path / "dual_stream")
         forget_place(pipeline)
         for name, part in pipeline.components.items():
             if isinstance(part, torch.nn.Module) and name not in kwargs:

@@ -57,8 +57,10 @@ def reading(path: Path) -> Iterator[None]:
     try:
         _check_index(path / INDEX_FILE)
         yield
-    except (UnirenderError, MemoryError):
+    except MemoryError:
         raise
+    except UnirenderError as error:  # of what is built, which knows no files
+        raise UnirenderError(f"{path}: {error}") from error
     except Exception as error:  # diffusers and safetensors raise half a dozen kinds for a broken file
         if out_of_memory(error):
             raise
