@@ -8,7 +8,7 @@ import difflib
 import functools
 import itertools
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,12 +74,37 @@ class Rule:
 
     Attributes:
         schema: the part, or what its `$ref` stands for.
-        allows: whether a value by itself, without what it contains, is allowed.
     """
 
     def __init__(self, schema: Mapping[str, Any], root: Mapping[str, Any]) -> None:
         self.root, self.schema = root, _resolved(schema, root)
-        self.allows = _test(self.schema)
+        read = self.schema.get
+        wanted = read("type", tuple(TYPES))
+        self._kinds = frozenset([wanted] if isinstance(wanted, str) else wanted)
+        self._least, self._most = read("minimum", -LARGEST), read("maximum", LARGEST)
+        self._shortest, self._pattern, self._choices = read("minLength", 0), read("pattern"), read("enum")
+        self._alternatives = [Rule(part, root) for part in read("anyOf", ())]
+
+    def allows(self, value: Any) -> bool:
+        """Whether a value by itself, without what it contains, is allowed."""
+        kinds = _kinds(type(value))
+        if kinds.isdisjoint(self._kinds):
+            return False
+        if "number" in kinds:
+            if not self._least <= value <= self._most:
+                return False
+        elif "string" in kinds and not (
+            len(value) >= self._shortest and (self._pattern is None or re.search(self._pattern, value))
+        ):
+            return False
+        if self._choices is not None and value not in self._choices:
+            return False
+        if "const" in self.schema and (value != self.schema["const"] or "boolean" in kinds):
+            return False
+        for rule in self._alternatives:
+            if rule.allows(value):
+                return True
+        return not self._alternatives
 
     @functools.cached_property
     def properties(self) -> "dict[str, Rule]":
@@ -131,35 +156,6 @@ def _check_object(value: dict[str, Any], rule: Rule, place: str) -> Iterator[Pro
 def _is_done(value: Any, rule: Rule) -> bool:
     """Whether a value is allowed and contains no others: most of them end here."""
     return not isinstance(value, (dict, list)) and rule.allows(value)
-
-
-def _test(schema: Mapping[str, Any]) -> Callable[[Any], bool]:
-    """What tells whether a value by itself, without what it contains, is allowed."""
-    wanted = schema.get("type", tuple(TYPES))
-    wanted = frozenset([wanted] if isinstance(wanted, str) else wanted)
-    least, most = schema.get("minimum", -LARGEST), schema.get("maximum", LARGEST)
-    shortest, pattern = schema.get("minLength", 0), schema.get("pattern")
-    choices, alternatives = schema.get("enum"), [_test(choice) for choice in schema.get("anyOf", ())]
-
-    def allows(value: Any) -> bool:
-        kinds = _kinds(type(value))
-        if kinds.isdisjoint(wanted):
-            return False
-        if "number" in kinds:
-            if not least <= value <= most:
-                return False
-        elif "string" in kinds and not (len(value) >= shortest and (pattern is None or re.search(pattern, value))):
-            return False
-        if choices is not None and value not in choices:
-            return False
-        if "const" in schema and (value != schema["const"] or "boolean" in kinds):
-            return False
-        for test in alternatives:
-            if test(value):
-                return True
-        return not alternatives
-
-    return allows
 
 
 @functools.cache
