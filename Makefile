@@ -32,7 +32,7 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-compile --constraint constraints.txt $(PIP_ARGS)
 REQUIREMENTS := pyproject.toml constraints.txt
 
-.PHONY: all setup lpips-vgg bench bench-full test collected test-long test-large test-report test-demo test-latex lint docs docs-check format clean
+.PHONY: all setup lpips-vgg bench bench-full test test-long test-large test-report test-demo test-latex lint docs docs-check format clean
 all: bench
 
 # A stamp is newer than what it was installed from, so a second `make` starts at once; both live in .venv and go with it.
@@ -66,14 +66,10 @@ lint: $(VENV)/.dev
 	$(BIN)/lint-imports
 	$(BIN)/pyright
 
-# Type checks take one core, and as long as documentation and collecting take another.
+# Type checks and documentation use one core each.
 test: $(VENV)/.dev
-	$(MAKE) --jobs=2 --no-print-directory lint docs-check collected
+	$(MAKE) --jobs=2 --no-print-directory lint docs-check
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
-
-# What tests import, compiled once; all of pytest's processes would compile all of it. What fails here fails in `test`.
-collected: $(VENV)/.dev
-	$(BIN)/python -m pytest --collect-only -qq > /dev/null || true
 
 # The notebooks run in `docs`.
 test-long: docs

@@ -189,3 +189,25 @@ def test_an_argument_is_looked_at_by_its_own_name() -> None:
         looked_at(name=1)
     with pytest.raises(TypeCheckError):
         looked_at(count="1")
+
+
+def test_a_function_that_is_made_at_every_call_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, with_hints = [], shape_checks._with_hints
+    monkeypatch.setattr(shape_checks, "_with_hints", lambda *what: made.append(what) or with_hints(*what))
+
+    def times(factor: int, hint: Any) -> Any:
+        def product(value: Any) -> Any:
+            return factor * value
+
+        product.__annotations__ = {"value": hint, "return": hint}
+        return shape_checks.checked(typechecker=None)(product)
+
+    assert [times(factor, float)(2.0) for factor in (1, 2, 3)] == [2.0, 4.0, 6.0]
+    assert len(made) == 1
+    for factor in (1, 2, 3):
+        assert times(factor, Float[np.ndarray, " n"])(np.ones(2)).sum() == 2 * factor
+    assert len(made) == 2
+    assert times(2, int)(2) == 4
+    for hint, wrong in ((float, "a"), (int, 2.0), (Float[np.ndarray, "n n"], np.ones(2))):
+        with pytest.raises(TypeCheckError):
+            times(2, hint)(wrong)  # what passed another hint, or none

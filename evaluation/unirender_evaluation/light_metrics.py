@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import minimize_scalar
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
@@ -97,6 +96,8 @@ def scaled_log_rmse(p: Float[np.ndarray, "h w 3"], t: Float[np.ndarray, "h w 3"]
     Raises:
         UnirenderError: `p` is black, which no factor makes a light.
     """
+    from scipy.optimize import minimize_scalar  # half a second, which tables of stored results do without
+
     if not p.max() > DIMMEST:
         raise UnirenderError(f"light metric: the found light is black, expected radiance above {DIMMEST:g}")
     w = texel_solid_angles(*p.shape[:2])[..., None]

@@ -111,10 +111,16 @@ def mean_estimate(
     if count < FEW:
         half = _student_half_width(sums, sizes, confidence)
         return Estimate(mean, mean - half, mean + half, x.size, count)
-    draws = np.random.default_rng(seed).integers(count, size=(resamples, count))
+    draws = _draws(count, resamples, seed)
     means = sums[draws].sum(axis=1) / sizes[draws].sum(axis=1)
     low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
     return Estimate(mean, float(low), float(high), x.size, count)
+
+
+@lru_cache(maxsize=4)  # the same for all numbers of a suite
+def _draws(count: int, resamples: int, seed: int) -> Int[np.ndarray, "r k"]:
+    """Which clusters each draw of the bootstrap takes."""
+    return np.random.default_rng(seed).integers(count, size=(resamples, count))
 
 
 def _student_half_width(sums: Float[np.ndarray, " k"], sizes: Int[np.ndarray, " k"], confidence: float) -> float:

@@ -104,3 +104,22 @@ def test_a_name_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(re, "search", lambda pattern, text: searched.append(text) or search(pattern, text))
     assert schema_problems(document, json_schema()) == []
     assert len(searched) == len(set(searched)) > 8  # a file has a million values, of a few hundred names
+
+
+def test_a_schema_is_read_once_whatever_the_number_of_values() -> None:
+    read = []
+
+    class Schema(dict):
+        def get(self, key: str, default: Any = None) -> Any:
+            read.append(key)
+            return super().get(key, default)
+
+    def reads(values: int) -> int:
+        read.clear()
+        each = Schema({"type": "number", "minimum": 0, "description": "a share"})
+        document = {f"m{i}": 0.5 for i in range(values)} | {"bad": -1}
+        problems = schema_problems(document, {"type": "object", "additionalProperties": each})
+        assert [str(problem) for problem in problems] == ["['bad']: got -1, expected a number (a share)"]
+        return len(read)
+
+    assert reads(1000) == reads(1)

@@ -203,6 +203,17 @@ def test_a_method_does_not_beat_itself_or_an_equal() -> None:
     assert paired_difference(a, b).n == 60
 
 
+def test_numbers_of_as_many_objects_share_their_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, generator = [], np.random.default_rng
+    monkeypatch.setattr(np.random, "default_rng", lambda seed: drawn.append(seed) or generator(seed))
+    rows = generator(0).normal(size=(3, 37))
+    found = [mean_estimate(row, seed=12345) for row in rows]
+    assert drawn == [12345]  # a table has hundreds of numbers
+    draws = generator(12345).integers(37, size=(2000, 37))
+    for row, estimate in zip(rows, found, strict=True):
+        assert [estimate.low, estimate.high] == pytest.approx(np.quantile(row[draws].mean(axis=1), [0.025, 0.975]))
+
+
 def test_only_common_samples_count() -> None:
     a, b = paired(1.0)
     b = dict(list(b.items())[:10]) | {"other": 100.0}

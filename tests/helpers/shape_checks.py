@@ -22,6 +22,9 @@ from beartype import BeartypeConf, beartype
 from jaxtyping import AbstractArray, TypeCheckError, install_import_hook
 
 REMEMBERED = 64  # kinds of calls of a function: where values count, there is no end of them
+# Kinds of the results by kinds of the arguments: of a function, and of all that are made by the same lines, as one
+# inside another is at each call of that one.
+_passed: dict[Any, dict[Any, set[Any]]] = {}
 _jaxtyped = jaxtyping.jaxtyped
 # An int is a float, as it is to Python and to pyright.
 _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True, violation_type=TypeCheckError))
@@ -75,7 +78,7 @@ def _checked_call(function: types.FunctionType, hints: dict[str, Any], in_contex
 def _remembering(function: types.FunctionType, hints: dict[str, Any], in_context: bool) -> Callable[..., Any]:
     """The function, checked at each call whose arguments and result are not of the kinds of a call before."""
     checked_call = _checked_call(function, hints, in_context)
-    passed: dict[Any, set[Any]] = {}  # kinds of the results by kinds of the arguments
+    passed = _passed.setdefault((function.__code__, repr(hints)), {})  # an array type is another each time
     by_value = any(_names_values(hint) for hint in hints.values())
 
     @functools.wraps(function)

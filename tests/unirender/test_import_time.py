@@ -94,6 +94,12 @@ print(isinstance(lean._when_loaded(torch.compiler.disable)(type("Own", (), {})),
     assert "torch._dynamo.convert_frame" in imported
 
 
+def test_results_are_read_without_what_only_measures_them() -> None:
+    _, imported = run_python("import unirender_evaluation.results.file, unirender_evaluation.tables.build")
+    assert "unirender_evaluation.light_metrics" in imported
+    assert not imported & {*FORBIDDEN, "torch"}
+
+
 def test_a_deferred_package_is_whole_for_whoever_asks_otherwise() -> None:
     """All of its names at once, or a file beside its code; a code that fails says so each time, not only at first."""
     code = """

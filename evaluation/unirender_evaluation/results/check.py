@@ -3,6 +3,7 @@
 A *problem* makes a file invalid. A *remark* is what a reader must know of a valid one.
 """
 
+import functools
 import math
 import re
 from collections import Counter
@@ -147,16 +148,15 @@ def _record_problems(record: Record) -> Iterator[tuple[str, str]]:
 
 def _value_problems(backbones: Iterable[str]) -> Callable[[Record], Iterator[tuple[str, str]]]:
     """A check of a record's values: unknown keys, and numbers better than perfect ones."""
-    backbones, known = tuple(backbones), {}
+    problem_of = functools.cache(functools.partial(_key_problem, backbones=tuple(backbones)))
+    metric_of = functools.cache(lambda key: ALL_METRICS[metric_name(key)])
 
     def check(record: Record) -> Iterator[tuple[str, str]]:
         for key, value in record.values.items():
-            if key not in known:
-                known[key] = _key_problem(key, backbones)
-            if known[key]:
-                yield f".values[{key!r}]", known[key]
+            if problem := problem_of(key):
+                yield f".values[{key!r}]", problem
             else:
-                metric = ALL_METRICS[metric_name(key)]
+                metric = metric_of(key)
                 sign = 1 if metric.higher_is_better else -1
                 if metric.name not in NO_BOUND and sign * value > sign * metric.perfect + TOLERANCE:
                     yield f".values[{key!r}]", f"a {metric.label} is better than a perfect one ({metric.perfect:g})"

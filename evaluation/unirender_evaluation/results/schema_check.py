@@ -49,7 +49,7 @@ def schema_problems(document: Any, schema: Mapping[str, Any]) -> list[Problem]:
         NotImplementedError: the schema has a keyword that is not understood here.
     """
     _check_keywords(schema)
-    return list(_check(document, _resolved(schema, schema), schema, ""))
+    return list(_check(document, Rule(schema, schema), ""))
 
 
 def _check_keywords(schema: Mapping[str, Any]) -> None:
@@ -69,67 +69,93 @@ def _resolved(schema: Mapping[str, Any], root: Mapping[str, Any]) -> Mapping[str
     return schema
 
 
-def _check(value: Any, schema: Mapping[str, Any], root: Mapping[str, Any], place: str) -> Iterator[Problem]:
-    if not _fits(value, schema):
-        yield Problem(place, f"got {quoted(value)}, expected {expected(schema)}")
+class Rule:
+    """A part of a schema, read once for all of the values that it is held against: a file has a million.
+
+    Attributes:
+        schema: the part, or what its `$ref` stands for.
+    """
+
+    def __init__(self, schema: Mapping[str, Any], root: Mapping[str, Any]) -> None:
+        self.root, self.schema = root, _resolved(schema, root)
+        read = self.schema.get
+        wanted = read("type", tuple(TYPES))
+        self._kinds = frozenset([wanted] if isinstance(wanted, str) else wanted)
+        self._least, self._most = read("minimum", -LARGEST), read("maximum", LARGEST)
+        self._shortest, self._pattern, self._choices = read("minLength", 0), read("pattern"), read("enum")
+        self._alternatives = [Rule(part, root) for part in read("anyOf", ())]
+
+    def allows(self, value: Any) -> bool:
+        """Whether a value by itself, without what it contains, is allowed."""
+        kinds = _kinds(type(value))
+        if kinds.isdisjoint(self._kinds):
+            return False
+        if "number" in kinds:
+            if not self._least <= value <= self._most:
+                return False
+        elif "string" in kinds and not (
+            len(value) >= self._shortest and (self._pattern is None or re.search(self._pattern, value))
+        ):
+            return False
+        if self._choices is not None and value not in self._choices:
+            return False
+        if "const" in self.schema and (value != self.schema["const"] or "boolean" in kinds):
+            return False
+        for rule in self._alternatives:
+            if rule.allows(value):
+                return True
+        return not self._alternatives
+
+    @functools.cached_property
+    def properties(self) -> "dict[str, Rule]":
+        """Those of the fields of an object that have a name."""
+        return {name: Rule(part, self.root) for name, part in self.schema.get("properties", {}).items()}
+
+    @functools.cached_property
+    def others(self) -> "Rule | None":
+        """That of all other fields of an object; None where there may be none."""
+        others = self.schema.get("additionalProperties", {})
+        return None if others is False else Rule(others, self.root)
+
+    @functools.cached_property
+    def items(self) -> "Rule":
+        """That of the items of a list."""
+        return Rule(self.schema.get("items", {}), self.root)
+
+
+def _check(value: Any, rule: Rule, place: str) -> Iterator[Problem]:
+    if not rule.allows(value):
+        yield Problem(place, f"got {quoted(value)}, expected {expected(rule.schema)}")
     elif isinstance(value, dict):
-        yield from _check_object(value, schema, root, place)
+        yield from _check_object(value, rule, place)
     elif isinstance(value, list):
-        items = _resolved(schema.get("items", {}), root)
         for i, item in enumerate(value):
-            if not _is_done(item, items):
-                yield from _check(item, items, root, f"{place}[{i}]")
+            if not _is_done(item, rule.items):
+                yield from _check(item, rule.items, f"{place}[{i}]")
 
 
-def _check_object(
-    value: dict[str, Any], schema: Mapping[str, Any], root: Mapping[str, Any], place: str
-) -> Iterator[Problem]:
-    known, others = schema.get("properties", {}), schema.get("additionalProperties", {})
-    others = others if others is False else _resolved(others, root)
-    pattern = schema.get("propertyNames", {}).get("pattern", "")
-    for name in schema.get("required", ()):
+def _check_object(value: dict[str, Any], rule: Rule, place: str) -> Iterator[Problem]:
+    known, others = rule.properties, rule.others
+    pattern = rule.schema.get("propertyNames", {}).get("pattern", "")
+    for name in rule.schema.get("required", ()):
         if name not in value:
-            yield Problem(place, f"field {name!r} is missing, expected {expected(known[name], root)}")
+            yield Problem(place, f"field {name!r} is missing, expected {expected(known[name].schema)}")
     for name, item in value.items():
         if name in known:
-            own = _resolved(known[name], root)
-            if not _is_done(item, own):
-                yield from _check(item, own, root, f"{place}.{name}" if place else name)
-        elif others is False:
+            if not _is_done(item, known[name]):
+                yield from _check(item, known[name], f"{place}.{name}" if place else name)
+        elif others is None:
             yield Problem(place, f"unknown field {name!r}{did_you_mean(name, known)}")
         else:
             if not _matches(pattern, name):
-                yield Problem(place, f"got the name {name!r}, expected {expected(schema)}")
+                yield Problem(place, f"got the name {name!r}, expected {expected(rule.schema)}")
             if not _is_done(item, others):
-                yield from _check(item, others, root, f"{place}[{quoted(name)}]")
+                yield from _check(item, others, f"{place}[{quoted(name)}]")
 
 
-def _is_done(value: Any, schema: Mapping[str, Any]) -> bool:
-    """Whether a value is allowed and contains no others: a file has a million, most of which end here."""
-    return not isinstance(value, (dict, list)) and _fits(value, schema)
-
-
-def _fits(value: Any, schema: Mapping[str, Any]) -> bool:
-    """Whether a value by itself, without what it contains, is allowed."""
-    kinds, wanted = _kinds(type(value)), schema.get("type")
-    if not kinds or (
-        wanted is not None and (wanted not in kinds if isinstance(wanted, str) else kinds.isdisjoint(wanted))
-    ):
-        return False
-    if "number" in kinds:
-        if not -LARGEST <= value <= LARGEST or not schema.get("minimum", value) <= value <= schema.get(
-            "maximum", value
-        ):
-            return False
-    elif "string" in kinds and not (
-        len(value) >= schema.get("minLength", 0) and ("pattern" not in schema or re.search(schema["pattern"], value))
-    ):
-        return False
-    if "enum" in schema and value not in schema["enum"]:
-        return False
-    if "const" in schema and (value != schema["const"] or "boolean" in kinds):
-        return False
-    return "anyOf" not in schema or any(_fits(value, choice) for choice in schema["anyOf"])
+def _is_done(value: Any, rule: Rule) -> bool:
+    """Whether a value is allowed and contains no others: most of them end here."""
+    return not isinstance(value, (dict, list)) and rule.allows(value)
 
 
 @functools.cache
@@ -146,10 +172,8 @@ def _matches(pattern: str, name: str) -> bool:
     return re.search(pattern, name) is not None
 
 
-def expected(schema: Mapping[str, Any], root: Mapping[str, Any] | None = None) -> str:
+def expected(schema: Mapping[str, Any]) -> str:
     """What a schema allows, in words."""
-    if "$ref" in schema and root is not None:
-        schema = root["$defs"][schema["$ref"].removeprefix("#/$defs/")]
     if "enum" in schema:
         return f"one of {', '.join(map(str, schema['enum']))}"
     if "const" in schema:

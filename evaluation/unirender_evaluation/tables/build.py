@@ -201,11 +201,11 @@ def _measured_row(
     spec: TableSpec, records: Sequence[Record], run: RunInfo, info: MethodInfo, variant: Variant, lights: Lights | None
 ) -> Row:
     """A row's cells: the mean of each column over the samples that have a value."""
-    objects = {record.sample: record.object for record in records}
-    answered = {key.partition(".")[0] for record in records if record.method == info.key for key in record.values}
+    own = [record for record in records if record.method == info.key]
+    objects = {record.sample: record.object for record in own}
     cells, n = [], 0
     for column in spec.columns:
-        values = values_of(records, info.key, column.key(variant))
+        values = values_of(own, info.key, column.key(variant))
         backbone = column.metric.name.removeprefix("lpips_")
         asked_for = column.metric.name.startswith("lpips_") and column.variant(variant).scale in LPIPS_SCALES
         missing = asked_for and backbone not in run.lpips
@@ -213,11 +213,12 @@ def _measured_row(
             if lights is None:
                 estimate = mean_estimate(list(values.values()), [objects[sample] for sample in values])
             else:
-                estimate = over_lights(values, records, lights)
+                estimate = over_lights(values, own, lights)
             cells.append(Cell(measured=estimate, exact=misleading_exact(column.key(variant), values.values())))
             n = max(n, estimate.n)
         else:
-            cells.append(Cell(unavailable=missing and column.quantity in answered))
+            answered = (key.startswith(f"{column.quantity}.") for record in own for key in record.values)
+            cells.append(Cell(unavailable=missing and any(answered)))
     return Row(info.key, info.label, info.kind, SECTIONS[info.kind], tuple(cells), info, n, info.stored)
 
 
