@@ -67,8 +67,8 @@ def _names(run: RunInfo, finding: Finding) -> tuple[str, str, str]:
     group = next(column.group for column in spec.columns if (column.quantity, column.metric.name) == asked)
     title = f"{spec.title}, {PROTOCOLS[claim.protocol].label}"
     labels = {info.key: info.label for info in run.methods}
-    rows = (labels.get(key, key) for key in (claim.a, claim.b))  # a row that did not run has no label
-    return f"{title}: {group} {claim.kind.label}{scale_said(claim)}", *rows
+    a, b = (labels.get(key, key) for key in (claim.a, claim.b))  # a row that did not run has no label
+    return f"{title}: {group} {claim.kind.label}{scale_said(claim)}", a, b
 
 
 def _cells(run: RunInfo, finding: Finding) -> tuple[str, ...]:
