@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import DEFAULT_VARIANT, SCALES, Metric
 from unirender_evaluation.records import Record, RunInfo
-from unirender_evaluation.statistics import Estimate, beats, crossed_estimate, paired_difference
+from unirender_evaluation.statistics import FEWEST, Estimate, beats, crossed_estimate, paired_difference
 from unirender_evaluation.tables.specs import Column, TableSpec
 
 Lights = Mapping[str, tuple[str, ...]]  # sample -> the lights that its values depend on
@@ -45,13 +45,13 @@ class Comparison:
 
     @property
     def decided(self) -> bool:
-        """Whether there is an interval: with fewer than two objects there is none."""
+        """Whether there is an interval: with fewer than `statistics.FEWEST` objects there is none."""
         return math.isfinite(self.difference.low)
 
     @property
     def verdict(self) -> str:
         if not self.decided:
-            return "is not comparable on one object with"
+            return f"is not comparable on fewer than {FEWEST} objects with"
         if self.a_beats_b or self.b_beats_a:
             return "beats" if self.a_beats_b else "is beaten by"
         return "is level with" if self.equal else "is not told from"

@@ -1,18 +1,16 @@
 """Intervals and paired tests, over objects.
 
-Samples of one object (several lights, several edits) are not independent, so a *cluster* bootstrap draws objects with
-replacement and takes all samples of each; the estimate stays the plain mean over samples. Everything is seeded: the
-same records give the same interval on every machine.
+Samples of one object (several lights, several edits) are not independent, so intervals are over objects: Student's t
+with the variance of a ratio of sums, since objects may have unequal numbers of samples (Cochran 1977, section 6.4); the
+estimate is the plain mean over samples. On draws of objects from stored results it holds the truth at least as often as
+a bootstrap of objects does, whatever their number (`results.coverage`).
 
-Of a few objects the bootstrap's interval is too narrow: of two it excludes the truth half of the time, of four one time
-in five, of ten one in ten. Below `FEW` objects the interval is Student's t over them, with the variance of a ratio of
-sums since objects may have unequal numbers of samples (Cochran 1977, section 6.4). Of two objects it holds the truth
-as often as of many, by being 12.7 standard errors wide to each side: paired tests use it, but beside a mean it tells a
-reader nothing, so that a ± is printed from `FEWEST_PRINTED` objects on (`Estimate.printed_half_width`).
+Of two objects Student's t is 12.7 standard errors wide to each side, and has no width at all where the two happen to
+agree: below `FEWEST` objects there is no interval, and nothing is decided.
 
 "A beats B" means: the paired 95 % interval of the difference excludes 0, on the better side.
 
-All of this is for the lights that the suite has: a light that several objects share is in every draw.
+All of this is for the lights that the suite has: a light that several objects share counts as often as they have it.
 `crossed_estimate` counts lights as drawn, too.
 """
 
@@ -31,27 +29,24 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 CONFIDENCE = 0.95
-RESAMPLES = 2000
-SEED = 0
-FEW = 20  # objects below which the interval is Student's
+FEWEST = 3  # objects from which on there is an interval
 FEWEST_LIGHTS = 5  # from which on it is told what holds under others; Student's t is then 2.8 errors to each side
 LEAST_SEEN = 0.1  # of the variance that lights make, in residuals: what all samples share is in none
-FEWEST_PRINTED = 3  # objects from which on half of the interval is printed beside a number, with ±
-METHOD = f"bootstrap, {RESAMPLES} draws, seed {SEED}, or Student's t below {FEW}"  # as protocol lines say it
+METHOD = "Student's t"  # as protocol lines say it
 CROSSED = f"{CONFIDENCE:.0%} over objects and lights, both as draws: two-way clusters, Student's t"
 INTERVAL = f"{CONFIDENCE:.0%} interval over objects ({METHOD})"  # as notes do
 UNTOLD = (
-    f"Numbers of one object, or under fewer than {FEWEST_LIGHTS} lights, have no ±: what they would be under others is "
-    "not told."
+    f"Numbers of fewer than {FEWEST} objects, or under fewer than {FEWEST_LIGHTS} lights, have no ±: what they would "
+    "be under others is not told."
 )
-UNPRINTED = "Numbers of two objects have no ±: with one degree of freedom their interval says next to nothing."
+UNPRINTED = f"Numbers of fewer than {FEWEST} objects have no ±: an interval of so few says next to nothing."
 
 
 @dataclass(frozen=True)
 class Estimate:
     """A mean with its interval.
 
-    `low` and `high` are NaN where no interval exists: fewer than two clusters, or an infinite value among them.
+    `low` and `high` are NaN where no interval exists: fewer than `FEWEST` clusters, or an infinite value among them.
     """
 
     mean: float
@@ -65,34 +60,20 @@ class Estimate:
         """Half the width of the interval, NaN where there is none."""
         return (self.high - self.low) / 2
 
-    @property
-    def printed_half_width(self) -> float:
-        """What stands behind ±: the same, NaN also of fewer than `FEWEST_PRINTED` objects."""
-        return self.half_width if self.clusters >= FEWEST_PRINTED else math.nan
-
 
 def unprinted_note(estimates: Iterable[Estimate | None]) -> tuple[str, ...]:
     """The note below a table that has numbers without ± for being of few objects; empty where it has none."""
-    without = (e for e in estimates if e and math.isnan(e.printed_half_width) and not math.isnan(e.half_width))
-    return (UNPRINTED,) if any(without) else ()
+    return (UNPRINTED,) if any(e and math.isfinite(e.mean) and e.clusters < FEWEST for e in estimates) else ()
 
 
 def mean_estimate(
-    values: Sequence[float] | Float[np.ndarray, " n"],
-    clusters: Sequence[Hashable] | None = None,
-    *,
-    confidence: float = CONFIDENCE,
-    resamples: int = RESAMPLES,
-    seed: int = SEED,
+    values: Sequence[float] | Float[np.ndarray, " n"], clusters: Sequence[Hashable] | None = None
 ) -> Estimate:
-    """Mean with its percentile interval, or Student's of fewer than `FEW` clusters.
+    """Mean with its interval over clusters.
 
     Args:
         values: one per sample; inf allowed (then there is no interval), NaN not.
         clusters: what each sample belongs to, e.g. its object; None = every sample for itself.
-        confidence: share of the interval.
-        resamples: bootstrap draws.
-        seed: of the draws.
 
     Raises:
         UnirenderError: if there are no values, a value is NaN, or lengths differ.
@@ -103,31 +84,18 @@ def mean_estimate(
     labels = list(range(x.size)) if clusters is None else list(clusters)
     if len(labels) != x.size:
         raise UnirenderError(f"mean: got {x.size} values and {len(labels)} cluster labels, expected as many")
-    count = len(set(labels))
-    mean = float(x.mean())
-    if count < 2 or not np.isfinite(x).all():
+    count, mean = len(set(labels)), float(x.mean())
+    if count < FEWEST or not np.isfinite(x).all():
         return Estimate(mean, math.nan, math.nan, x.size, count)
-    sums, sizes = _cluster_sums(x, labels)
-    if count < FEW:
-        half = _student_half_width(sums, sizes, confidence)
-        return Estimate(mean, mean - half, mean + half, x.size, count)
-    draws = _draws(count, resamples, seed)
-    means = sums[draws].sum(axis=1) / sizes[draws].sum(axis=1)
-    low, high = np.quantile(means, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Estimate(mean, float(low), float(high), x.size, count)
+    half = student_half_width(_ratio_variance(*_cluster_sums(x, labels)), count - 1)
+    return Estimate(mean, mean - half, mean + half, x.size, count)
 
 
-@lru_cache(maxsize=4)  # the same for all numbers of a suite
-def _draws(count: int, resamples: int, seed: int) -> Int[np.ndarray, "r k"]:
-    """Which clusters each draw of the bootstrap takes."""
-    return np.random.default_rng(seed).integers(count, size=(resamples, count))
-
-
-def _student_half_width(sums: Float[np.ndarray, " k"], sizes: Int[np.ndarray, " k"], confidence: float) -> float:
-    """Half of Student's interval of sum(sums) / sum(sizes), of independent clusters."""
+def student_half_width(variance: float, degrees: int) -> float:
+    """Half of the interval of a mean with this variance, estimated with so many degrees of freedom."""
     from scipy.special import stdtrit
 
-    return float(stdtrit(len(sums) - 1, (1 + confidence) / 2) * math.sqrt(_ratio_variance(sums, sizes)))
+    return float(stdtrit(degrees, (1 + CONFIDENCE) / 2) * math.sqrt(variance))
 
 
 def _ratio_variance(sums: Float[np.ndarray, " k"], sizes: Int[np.ndarray, " k"]) -> float:
@@ -141,8 +109,6 @@ def crossed_estimate(
     values: Sequence[float] | Float[np.ndarray, " n"],
     objects: Sequence[str],
     lights: Sequence[tuple[str, ...]],
-    *,
-    confidence: float = CONFIDENCE,
 ) -> Estimate:
     """Mean with its interval where objects and lights are both draws: samples that share any of them go together.
 
@@ -156,16 +122,14 @@ def crossed_estimate(
         objects: of each sample.
         lights: of each sample, all that its value depends on, in their places: of a relit picture that of the input,
             then that it is relit by.
-        confidence: share of the interval.
 
     Returns:
-        No interval (NaN) of fewer than two objects or `FEWEST_LIGHTS` lights, nor where nearly all samples share one.
+        No interval (NaN) of fewer than `FEWEST` objects or `FEWEST_LIGHTS` lights, nor where nearly all samples share
+        one.
 
     Raises:
         UnirenderError: there are no values, one is NaN, or lengths differ.
     """
-    from scipy.special import stdtrit
-
     x = np.asarray(values, dtype=np.float64)
     if not 0 < len(x) == len(objects) == len(lights) or np.isnan(x).any():
         raise UnirenderError(
@@ -173,13 +137,13 @@ def crossed_estimate(
             "expected as many of each, at least one, and no NaN"
         )
     mean, counts = float(x.mean()), (len(set(objects)), light_count(lights))
-    terms = _light_terms(tuple(objects), tuple(lights)) if counts[0] > 1 and counts[1] >= FEWEST_LIGHTS else None
+    terms = _light_terms(tuple(objects), tuple(lights)) if counts[0] >= FEWEST and counts[1] >= FEWEST_LIGHTS else None
     if terms is None or not np.isfinite(x).all():
         return Estimate(mean, math.nan, math.nan, len(x), counts[0])
     over_objects = _ratio_variance(*_cluster_sums(x, objects))
     over_lights, over_both = (float((x - mean) @ (term @ (x - mean))) for term in terms)
     variance = max(over_objects + over_lights - over_both, over_objects, over_lights)
-    half = float(stdtrit(min(counts) - 1, (1 + confidence) / 2) * math.sqrt(variance))
+    half = student_half_width(variance, min(counts) - 1)
     return Estimate(mean, mean - half, mean + half, len(x), counts[0])
 
 
@@ -267,14 +231,15 @@ def beats(
 ) -> bool:
     """Whether a beats b: the paired 95 % interval excludes 0 on the better side.
 
-    Without an interval (fewer than two objects in common) nothing beats anything.
+    Without an interval (fewer than `FEWEST` objects in common) nothing beats anything.
     """
     difference = paired_difference(a, b, clusters)
     return difference.low > 0 if higher_is_better else difference.high < 0
 
 
 def paired_p_value(a: Mapping[str, float], b: Mapping[str, float], clusters: Mapping[str, Hashable]) -> float:
-    """Two-sided p of Student's t for no difference of a and b over the samples that both have; 1 with one cluster.
+    """Two-sided p of Student's t for no difference of a and b over the samples that both have; 1 with fewer than
+    `FEWEST` clusters.
 
     Args:
         a: sample -> value.
@@ -286,7 +251,7 @@ def paired_p_value(a: Mapping[str, float], b: Mapping[str, float], clusters: Map
     common = sorted(a.keys() & b.keys())
     x = np.array([a[sample] - b[sample] for sample in common])
     sums, sizes = _cluster_sums(x, [clusters[sample] for sample in common])
-    if len(sums) < 2 or not x.mean():  # which may be the mean of every object, too
+    if len(sums) < FEWEST or not x.mean():  # which may be the mean of every object, too
         return 1.0
     with np.errstate(divide="ignore"):  # differences that are all alike
         t = np.abs(x.mean()) / np.sqrt(_ratio_variance(sums, sizes))

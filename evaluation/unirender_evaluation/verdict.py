@@ -2,20 +2,22 @@
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from unirender_evaluation.claims import CEILING, OUR_CLAIMS, Claim, run_claims
 from unirender_evaluation.comparisons import Comparison, Lights, Selection, compare, difference_over_lights, values_of
 from unirender_evaluation.records import Record, RunInfo
-from unirender_evaluation.statistics import FEW, Estimate, holm, light_count, paired_difference, paired_p_value
+from unirender_evaluation.statistics import Estimate, holm, light_count, paired_difference, paired_p_value
 from unirender_evaluation.task import LIGHT
+
+FEW = 20  # objects or lights, of fewer of which what is not shown is open
 
 
 @dataclass(frozen=True)
 class Finding:
     """A claim with its comparison: None where a row has no such value. `holds` is None for a distance that is only
-    stated, for one object, and where nothing was compared, for the reason `why`. `asked`: on how many samples any row
+    stated, and where nothing was compared, for the reason `why`. `asked`: on how many samples any row
     has this number, since a row may answer the easy ones alone. `over_lights`: the difference again, with its interval
     over objects and lights; None where the lights of the samples, of which there are `lights`, are not known."""
 
@@ -65,7 +67,7 @@ class Finding:
     def number(self) -> str:
         """Which number it is about."""
         c = self.claim
-        return f"{c.table}/{c.protocol} {c.quantity} {c.kind.label}{_scale(c)}"
+        return f"{c.table}/{c.protocol} {c.quantity} {c.kind.label}{scale_said(c)}"
 
     def __str__(self) -> str:
         c = self.claim
@@ -74,7 +76,7 @@ class Finding:
         d = self.comparison.difference
         unit = c.kind.unit
         remark = f"; {c.remark}" if c.remark else ""
-        interval = f"[{d.low:+.4g}, {d.high:+.4g}] " if self.comparison.decided else ""  # one object has none
+        interval = f"[{d.low:+.4g}, {d.high:+.4g}] " if self.comparison.decided else ""
         objects = f"{d.clusters} object{'s' * (d.clusters != 1)}"
         n = f"{d.n} of {self.asked}" if d.n < self.asked else f"{d.n}"
         return (
@@ -92,7 +94,7 @@ class Finding:
         return f"; under other lights: {said}[{found.low:+.4g}, {found.high:+.4g}]"
 
 
-def _scale(claim: Claim) -> str:
+def scale_said(claim: Claim) -> str:
     """How a number is aligned; that it is not is said of the light alone."""
     unsaid = "scale" not in claim.kind.axes or (claim.scale == "raw" and claim.table != LIGHT[0])
     return "" if unsaid else f" ({claim.scale})"
@@ -111,7 +113,7 @@ def findings(
         common = a.keys() & b.keys()
         if common and all(math.isfinite(b[sample]) for sample in common):
             comparison = compare(chosen, claim.kind, key, claim.a, claim.b)
-            claimed = claim.expected == "beats" and comparison.decided
+            claimed = claim.expected == "beats"
             asked = len({record.sample for record in whole if key in record.values})
             finding = Finding(claim, comparison, comparison.a_beats_b if claimed else None, asked=asked)
             if lights:
@@ -215,19 +217,30 @@ def judged(records: Sequence[Record], run: RunInfo, lights: Lights | None) -> li
     return findings(records, run_claims(records, run), named)
 
 
-def summary(records: Sequence[Record], found: Sequence[Finding]) -> list[str]:
-    """How many of the claims that hold are certain together, and how many hold under other lights."""
-    return [*_corrected_lines(records, found), *_other_lights_lines(found)] if any(f.comparison for f in found) else []
+def _by_keys(finding: Finding) -> str:
+    """A claim by the keys of its rows."""
+    return f"{finding.number} of {finding.claim.a} against {finding.claim.b}"
 
 
-def _corrected_lines(records: Sequence[Record], found: Sequence[Finding]) -> list[str]:
+Named = Callable[[Finding], str]
+
+
+def summary(records: Sequence[Record], found: Sequence[Finding], named: Named = _by_keys) -> list[str]:
+    """How many of the claims that hold are certain together, and how many hold under other lights; `named`: how the
+    others are called."""
+    if not any(f.comparison for f in found):
+        return []
+    return [*_corrected_lines(records, found, named), *_other_lights_lines(found, named)]
+
+
+def _corrected_lines(records: Sequence[Record], found: Sequence[Finding], named: Named) -> list[str]:
     """How many of the claims that hold would do so if all claims were one question; nothing where none holds."""
     claimed = [finding for finding in found if finding.holds is not None]
     sure = holm([_p_value(records, finding.claim) for finding in claimed])
     holding = [(f, certain) for f, certain in zip(claimed, sure, strict=True) if f.holds]
     if not holding:
         return []
-    unsure = [f"{f.number} of {f.claim.a} against {f.claim.b}" for f, certain in holding if not certain]
+    unsure = [named(f) for f, certain in holding if not certain]
     but = f"; not {', '.join(unsure)}" if unsure else ""
     return [
         f"of {len(holding)} claims that hold {len(holding) - len(unsure)} also do after Holm's correction for all "
@@ -235,18 +248,18 @@ def _corrected_lines(records: Sequence[Record], found: Sequence[Finding]) -> lis
     ]
 
 
-def _other_lights_lines(found: Sequence[Finding]) -> list[str]:
+def _other_lights_lines(found: Sequence[Finding], named: Named) -> list[str]:
     """How many of the claims that hold also do under other lights, and which do not; nothing where none holds."""
     if all(finding.over_lights is None for finding in found):
         return [UNNAMED]
     holding = [finding for finding in found if finding.holds]
     if not holding:
         return []
-    named = {
-        word: [f"{f.number} of {f.claim.a} against {f.claim.b}" for f in holding if f.other_lights in words]
+    missing = {
+        word: [named(f) for f in holding if f.other_lights in words]
         for word, words in (("not", ("open", "fails")), ("not told of", ("not told",)))
     }
-    but = "".join(f"; {word} {', '.join(names)}" for word, names in named.items() if names)
+    but = "".join(f"; {word} {', '.join(names)}" for word, names in missing.items() if names)
     also = sum(finding.other_lights == "holds" for finding in holding)
     wider = sorted(ratio for finding in holding if math.isfinite(ratio := finding.times_as_wide))
     grown = f"; their intervals are {wider[0]:.2f} to {wider[-1]:.2f} times as wide" if wider else ""

@@ -115,7 +115,7 @@ def test_a_table_may_have_some_rows_and_columns_alone(bench, files: tuple[Path, 
 
 def test_intervals_of_tables_may_be_over_lights_too(bench, files: tuple[Path, Path]) -> None:
     asked = ("tables", files[0], "--table", "relighting", "--format", "markdown")
-    assert "interval: 95% over objects, under these lights: bootstrap" in bench(*asked)[1]
+    assert "interval: 95% over objects, under these lights: Student's t" in bench(*asked)[1]
     status, out, _ = bench(*asked, "--interval", "objects-and-lights")
     assert status == 0
     assert "interval: 95% over objects and lights, both as draws: two-way clusters, Student's t" in out
@@ -132,19 +132,22 @@ def test_verdict_in_every_format(bench, files: tuple[Path, Path]) -> None:
     status, out, _ = bench("verdict", files[0])
     assert status == 0
     claim = "HOLDS  inverse/single-image albedo PSNR: ours-mean beats input-as-albedo, difference +8 [+8, +8] dB"
-    assert f"{claim} (n 4, 2 objects); under other lights: not told by 4 lights" in out
+    assert f"{claim} (n 4, 3 objects); under other lights: not told by 4 lights" in out
     assert "open   truth: what its check found stands in the run's verdict.txt" in out
     made = json.loads(bench("verdict", files[0], "--format", "json")[1])
     found = next(
         c for c in made["claims"] if (c["quantity"], c["b"], c["scale"]) == ("albedo", "input-as-albedo", "raw")
     )
     assert found["other_lights"] == {"state": "not told", "lights": 4, "low": None, "high": None}
-    assert (found["state"], found["difference"], found["objects"]) == ("holds", 8, 2)
+    assert (found["state"], found["difference"], found["objects"]) == ("holds", 8, 3)
     assert {c["state"] for c in made["claims"]} == {"holds", "not run"}
-    said = "| +8 dB | holds [+8, +8] | not told | 4 (2, 4) |"
+    said = (
+        "| Inverse rendering, from the image: Albedo PSNR | Ours (mean) | input as albedo | +8 dB | holds [+8, +8] "
+        "| not told | 4 (3, 4) |"
+    )
     assert said in bench("verdict", files[0], "--format", "markdown")[1].replace("\N{NO-BREAK SPACE}", " ")
     latex = bench("verdict", files[0], "--format", "latex")[1]
-    assert r"ours-mean & input-as-albedo & +8 dB & holds [+8, +8] & not told & 4 (2, 4) \\" in latex
+    assert r"Albedo PSNR & Ours (mean) & input as albedo & +8 dB & holds [+8, +8] & not told & 4 (3, 4) \\" in latex
     assert r"\end{table*}" in latex
 
 
@@ -172,8 +175,8 @@ def test_compare_prints_both_means_the_difference_and_the_ranks_in_80_columns(be
         (a, b) for a, b in zip(out.splitlines(), out.splitlines()[1:], strict=False) if "Albedo PSNR" in a
     )
     assert [word for word in line.split() if "." in word] == ["20.75", "23.25", "-2.50"]
-    assert "[-15.21, +10.21]" in below
-    assert "A is not" in out  # told from B: of two objects little is decided
+    assert "[-5.86, +0.86]" in below
+    assert "A is not" in out  # told from B: of three objects little is decided
     assert "…" not in out
     assert max(map(len, out.splitlines()[3:])) <= 80
     status, out, _ = bench("compare", files[0], files[0], "--method", "ours-mean=input-as-albedo")

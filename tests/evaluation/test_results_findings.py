@@ -37,16 +37,16 @@ def test_an_answer_is_both_means_over_shared_samples_and_the_paired_difference()
     asked = question("ours-mean", "input-as-albedo")
     found = lines(answers(small_results(), [asked], {asked}))
     rows, means = ["Ours (mean)", "input as albedo"], ["20.75", "12.75"]
-    assert found == [["albedo", *rows, *means, "+8.00 [+8.00, +8.00]", "**A is better**", "2 of 2 (4)"]]
+    assert found == [["albedo", *rows, *means, "+8.00 [+8.00, +8.00]", "**A is better**", "3 of 3 (4)"]]
     backwards = lines(answers(small_results(), [question("input-as-albedo", "ours-mean")], ()))
-    assert backwards[0][5:] == ["-8.00 [-8.00, -8.00]", "B is better", "0 of 2 (4)"]
+    assert backwards[0][5:] == ["-8.00 [-8.00, -8.00]", "B is better", "0 of 3 (4)"]
 
 
 def test_objects_are_counted_by_their_means_and_less_of_an_error_is_better() -> None:
-    """Of ball-1 one picture of two is better, by less than the other is worse."""
+    """Of ball-0 one picture of two is better, by less than the other is worse."""
     key, changes = (
         metric_key("albedo", "psnr"),
-        {"ball-0_l0": 1.0, "ball-0_l1": 1.0, "ball-1_l0": 1.0, "ball-1_l1": -9.0},
+        {"ball-0_l0": 1.0, "ball-0_l1": -9.0, "ball-1_l0": 1.0, "ball-2_l0": 1.0},
     )
     one = small_results()
     changed = [
@@ -57,7 +57,7 @@ def test_objects_are_counted_by_their_means_and_less_of_an_error_is_better() -> 
     both = replace(one, records=(*one.records, *changed))
     rough = Question("roughness", "inverse", "single-image", "roughness", "mse", "ours-mean", "other")
     found = lines(answers(both, [question("other", "ours-mean"), rough], ()))
-    assert [line[-1] for line in found] == ["1 of 2 (4)", "2 of 2 (4)"]
+    assert [line[-1] for line in found] == ["2 of 3 (4)", "3 of 3 (4)"]
 
 
 def test_what_is_sure_is_so_for_all_lines_together() -> None:
@@ -108,7 +108,7 @@ def test_rows_of_two_runs_of_a_suite_are_paired_by_sample() -> None:
     both = together({"small": one, "tiny": other})
     found = lines(answers(both, [question("ours-mean@small", "ours-mean@tiny")], ()))
     rows = ["Ours (mean), small", "Ours (mean), tiny"]
-    assert found == [["albedo", *rows, "20.75", "17.75", "+3.00 [+3.00, +3.00]", "A is better", "2 of 2 (4)"]]
+    assert found == [["albedo", *rows, "20.75", "17.75", "+3.00 [+3.00, +3.00]", "A is better", "3 of 3 (4)"]]
     larger = replace(other, run=replace(other.run, resolution=2 * other.run.resolution))
     for wrong in ({}, {"small": one, "tiny": larger}):
         with pytest.raises(UnirenderError, match="expected the same one"):
@@ -119,8 +119,8 @@ def test_samples_that_only_one_row_has_do_not_count() -> None:
     records = tuple(r for r in small_records() if r.method == "ours-mean" or r.sample.endswith("l0"))
     results = Results(RUN, records, definitions(records), "a")
     found = lines(answers(results, [question("ours-mean", "input-as-albedo")], ()))
-    assert found[0][3:5] == ["20.50", "12.50"]
-    assert found[0][-1] == "2 of 2 (2)"
+    assert found[0][3:5] == ["20.83", "12.83"]
+    assert found[0][-1] == "3 of 3 (3)"
 
 
 def test_level_rows_and_single_objects_are_not_called_better() -> None:
@@ -131,7 +131,7 @@ def test_level_rows_and_single_objects_are_not_called_better() -> None:
     assert found[0][6] == "no difference shown"
     one = tuple(r for r in small_records() if r.object == "ball-0")
     found = lines(answers(Results(RUN, one, definitions(one), "a"), [question("ours-mean", "input-as-albedo")], ()))
-    assert found[0][6] == "one object: no interval"
+    assert found[0][5:7] == ["+8.00", "fewer than 3 objects: no interval"]
 
 
 def test_a_row_that_did_not_run_says_so() -> None:
@@ -161,4 +161,4 @@ def test_seconds_are_the_median_of_what_was_recorded() -> None:
 
 def test_the_run_is_named() -> None:
     line = run_line(small_results())
-    assert line.startswith("`ball`: 2 objects at 32 x 32 pixels, 20 answers; truth `0123456789ab`")
+    assert line.startswith("`ball`: 3 objects at 32 x 32 pixels, 20 answers; truth `0123456789ab`")

@@ -222,7 +222,7 @@ def test_a_truth_may_stay_unchecked_and_every_table_says_so(suite: Suite, tmp_pa
         "  open   truth: not rendered again, --check-scenes 0"
     )
     run = RunInfo("t", "h", 64, (), unchecked=check["unchecked"], mitsuba="3.9.1", truth_spp=64)
-    line = dict(protocol_line(PROTOCOLS["from-image"], Variant(), run, [], [], None))
+    line = dict(protocol_line(PROTOCOLS["from-image"], Variant(), run, [], [], (), None))
     assert line["truth"] == "Mitsuba 3.9.1, 64 spp, unchecked (--check-scenes 0)"
 
 

@@ -17,6 +17,7 @@ METHODS = (
     MethodInfo("input-as-albedo", "input as albedo", "trivial", config={"trivial": "input"}),
     MethodInfo("noise-ceiling", "Noise ceiling", "ceiling", config={"bound": "noise-ceiling"}),
 )
+SCENES = ("ball-0_l0", "ball-0_l1", "ball-1_l0", "ball-2_l0")  # of three objects
 LEVELS = {"ours-mean": 20.0, "input-as-albedo": 12.0, "noise-ceiling": 46.0}
 RUN = RunInfo(
     "ball", HASH, 32, METHODS, coverage=0.3, mitsuba="3.9.1", truth_spp=64, code="abc", date="2026-01-31", seeds=(0,)
@@ -25,23 +26,21 @@ RUN = RunInfo(
 
 def small_lights() -> Lights:
     """Each scene has a light of its own; all are relit by the same."""
-    scenes = [f"ball-{i // 2}_l{i % 2}" for i in range(4)]
-    return {name: own for scene in scenes for name, own in ((scene, (scene,)), (f"{scene}_to_x", (scene, "x")))}
+    return {name: own for scene in SCENES for name, own in ((scene, (scene,)), (f"{scene}_to_x", (scene, "x")))}
 
 
 def small_records() -> list[Record]:
     """Albedo in both masks and roughness; the relit picture without the ceiling."""
     records = []
     for method, level in LEVELS.items():
-        for i in range(4):
+        for i, name in enumerate(SCENES):
             db = level + 0.5 * i
             values = {metric_key("albedo", "psnr", Variant(mask)): db for mask in ("masked", "whole")}
             values[metric_key("roughness", "mse")] = 1 / db
-            name = f"ball-{i // 2}_l{i % 2}"
-            records.append(Record("inverse", "single-image", method, name, f"ball-{i // 2}", values))
+            records.append(Record("inverse", "single-image", method, name, name[:6], values))
             if method != "noise-ceiling":
                 relit = {metric_key("relit", "psnr"): db - 1}
-                records.append(Record("relighting", "from-image-hdri", method, f"{name}_to_x", f"ball-{i // 2}", relit))
+                records.append(Record("relighting", "from-image-hdri", method, f"{name}_to_x", name[:6], relit))
     return records
 
 

@@ -62,7 +62,7 @@ def _strip_plot(
     rows = []
     for key, found in values.items():
         estimate = mean_estimate(list(found.values()), [objects[sample] for sample in found])
-        interval = not math.isnan(estimate.printed_half_width)
+        interval = not math.isnan(estimate.half_width)
         rows.append(
             {
                 "label": run.method(key).label + (FEW.format(len(found)) if len(found) < most else ""),

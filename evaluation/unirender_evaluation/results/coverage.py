@@ -1,17 +1,24 @@
-"""How often 95 % intervals hold the truth, by simulation: `python -m unirender_evaluation.results.coverage [SUITE]`.
+"""How often 95 % intervals hold the truth: `python -m unirender_evaluation.results.coverage [SUITE [RESULTS]]`.
 
 Draws paired differences of two rows on the objects and lights that a suite has, where objects, lights and pictures
-differ by known amounts, and counts how often each interval (`statistics`) holds their mean. The second table asks the
-same of few objects whose differences have heavy tails.
+differ by known amounts, and counts how often each interval (`statistics`) holds their mean. A second table takes what
+the objects of stored results have for all there is, draws as few of them as a suite may have, and counts how often
+their interval holds the mean of all: Student's t, which `statistics` has, and a bootstrap of objects.
 """
 
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from unirender_evaluation.claims import run_claims
+from unirender_evaluation.comparisons import Selection, values_of
+from unirender_evaluation.results.data import Results
+from unirender_evaluation.results.file import read_results
 from unirender_evaluation.results.findings import markdown_table
 from unirender_evaluation.statistics import (
     CONFIDENCE,
@@ -25,14 +32,11 @@ from unirender_evaluation.suites.suite import Suite, load_suite
 TRUE = 1.0  # the mean difference
 TRIALS = 1000
 SPREADS = ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0), (1.0, 2.0))  # of objects and lights; pictures: 1
+DRAWS = 200  # of stored objects, for each number
+COUNTS = (5, 10, 20, 30, 40, 50, 60)  # of objects that are drawn
+RESAMPLES = 1000  # of a bootstrap
 Samples = tuple[list[str], list[tuple[str, ...]]]  # of each the object, and its lights
-Draw = Callable[[np.random.Generator, int], Float[np.ndarray, " n"]]
-TAILS: Mapping[str, Draw] = {  # of mean TRUE
-    "normal": lambda rng, n: TRUE + rng.normal(size=n),
-    "Student's t, 3": lambda rng, n: TRUE + rng.standard_t(3, size=n),
-    "exponential": lambda rng, n: TRUE * rng.exponential(size=n),
-    "log-normal": lambda rng, n: TRUE * np.exp(rng.normal(size=n) - 0.5),
-}
+Objects = list[Float[np.ndarray, " _"]]  # the values of each
 
 
 def of_suite(suite: Suite, relit: bool) -> Samples:
@@ -82,23 +86,57 @@ def coverage(
     return float(held[0] / trials), float(held[1] / trials)
 
 
-def tails(draw: Draw, count: int, trials: int = TRIALS, seed: int = 0) -> tuple[float, float]:
-    """Shares of the bootstrap's intervals of `count` objects with a sample each, and of Student's, that hold the mean.
+def stored_numbers(results: Results) -> dict[str, list[Objects]]:
+    """What the claims of a run are about, of those on all of its objects: the differences of A and B, and what A has
+    itself. Rows that are level, and answers that are the truth to the bit, are left out."""
+    count = len({record.object for record in results.records})
+    found: dict[str, list[Objects]] = {"A - B": [], "A": []}
+    for claim in run_claims(results.records, results.run):
+        records = Selection(claim.table, claim.protocol).of(results.records)
+        a, b = (values_of(records, row, claim.key) for row in (claim.a, claim.b))
+        object_of = {record.sample: record.object for record in records}
+        of_object: dict[str, list[tuple[float, float]]] = {}
+        for sample in sorted(a.keys() & b.keys()):
+            of_object.setdefault(object_of[sample], []).append((a[sample] - b[sample], a[sample]))
+        pairs = [np.array(own) for own in of_object.values()]
+        if len(pairs) == count and np.isfinite(np.concatenate(pairs)).all() and any(own[:, 0].any() for own in pairs):
+            found["A - B"].append([own[:, 0] for own in pairs])
+            found["A"].append([own[:, 1] for own in pairs])
+    return found
+
+
+def coverage_of_draws(objects: Objects, count: int, draws: int = DRAWS, seed: int = 0) -> tuple[float, float]:
+    """Shares of Student's intervals and of the bootstrap's of `count` objects that hold the mean of all.
 
     Args:
-        draw: of values, whose mean is `TRUE`.
-        count: at least `FEW` objects, from which on `mean_estimate` is the bootstrap.
-        trials: draws.
+        objects: all there are.
+        count: how many of them are drawn, each as often as it comes.
+        draws: trials.
         seed: of them.
     """
-    from scipy.special import stdtrit
+    true, rng, held = float(np.concatenate(objects).mean()), np.random.default_rng(seed), np.zeros(2)
+    for _ in range(draws):
+        drawn = [objects[i] for i in rng.integers(len(objects), size=count)]
+        sizes = np.array([len(own) for own in drawn])
+        student = mean_estimate(np.concatenate(drawn), np.repeat(np.arange(count), sizes).tolist())
+        low, high = bootstrap(np.array([own.sum() for own in drawn]), sizes)
+        held += [student.low <= true <= student.high, low <= true <= high]
+    return float(held[0] / draws), float(held[1] / draws)
 
-    rng, held, reach = np.random.default_rng(seed), np.zeros(2), float(stdtrit(count - 1, (1 + CONFIDENCE) / 2))
-    for trial in range(trials):
-        values = draw(rng, count)
-        bootstrap, half = mean_estimate(values, seed=trial), reach * values.std(ddof=1) / math.sqrt(count)
-        held += [bootstrap.low <= TRUE <= bootstrap.high, abs(values.mean() - TRUE) <= half]
-    return float(held[0] / trials), float(held[1] / trials)
+
+def bootstrap(sums: Float[np.ndarray, " k"], sizes: Int[np.ndarray, " k"]) -> tuple[float, float]:
+    """Percentile interval of sum(sums) / sum(sizes), whose clusters are drawn with replacement."""
+    picked = _picked(len(sums))
+    means = (picked @ sums) / (picked @ sizes)
+    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
+
+
+@lru_cache(maxsize=1)
+def _picked(count: int) -> Float[np.ndarray, "draws k"]:
+    """How often each draw has each of `count` clusters."""
+    draws = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
+    return np.stack([np.bincount(draw, minlength=count) for draw in draws]).astype(np.float64)
 
 
 def lights_table(structures: Mapping[str, Samples]) -> str:
@@ -111,14 +149,17 @@ def lights_table(structures: Mapping[str, Samples]) -> str:
     return markdown_table(head, lines)
 
 
-def tails_table() -> str:
-    """Coverage by the differences' tails and the number of objects, bootstrap / Student's t, in percent."""
-    counts = (21, 30, 40, 50, 100)
-    lines = [
-        [name, *(" / ".join(f"{100 * held:.1f}" for held in tails(draw, count)) for count in counts)]
-        for name, draw in TAILS.items()
-    ]
-    return markdown_table(["differences", *map(str, counts)], lines)
+def draws_table(results: Results, counts: Sequence[int] = COUNTS, draws: int = DRAWS) -> str:
+    """Coverage by how many objects of stored results are drawn, Student's t / bootstrap, in percent: the mean over the
+    numbers that claims are about, and the number whose intervals hold it least often."""
+    lines = []
+    for name, numbers in stored_numbers(results).items():
+        held = [[coverage_of_draws(objects, count, draws) for count in counts] for objects in numbers]
+        shares = 100 * np.array(held)  # (numbers, counts, 2)
+        for word, percent in (("mean", shares.mean(axis=0)), ("least", shares.min(axis=0))):
+            cells = (f"{student:.1f} / {resampled:.1f}" for student, resampled in percent)
+            lines.append([f"{name}, {len(numbers)} numbers: {word}", *cells])
+    return markdown_table([f"objects of {results.run.suite}", *map(str, counts)], lines)
 
 
 def structures(suite: Suite) -> dict[str, Samples]:
@@ -133,4 +174,5 @@ def structures(suite: Suite) -> dict[str, Samples]:
 
 if __name__ == "__main__":
     print(lights_table(structures(load_suite(sys.argv[1] if len(sys.argv) > 1 else "tiny"))))
-    print(tails_table())
+    if sys.argv[2:]:
+        print(draws_table(read_results(Path(sys.argv[2]))))

@@ -16,7 +16,7 @@ from unirender_evaluation.claims import MASKED, MaskedNumber
 from unirender_evaluation.comparisons import Comparison, Selection, compare, values_of, without_rounding
 from unirender_evaluation.metrics import METRICS, Metric, Scale, metric_key
 from unirender_evaluation.results.data import Results
-from unirender_evaluation.statistics import Estimate, holm, paired_p_value
+from unirender_evaluation.statistics import FEWEST, Estimate, holm, paired_p_value
 from unirender_evaluation.tables.published import published_tables
 from unirender_evaluation.tables.text import markdown_row
 
@@ -86,14 +86,15 @@ def _answer(results: Results, question: Question, sure: bool) -> list[str]:
 
 
 def interval_text(difference: Estimate, metric: Metric) -> str:
-    """A difference with its interval, in the digits of its metric."""
+    """A difference with its interval, where it has one, in the digits of its metric."""
     low, high, decimals = difference.low, difference.high, metric.decimals
-    return f"{difference.mean:+.{decimals}f} [{low:+.{decimals}f}, {high:+.{decimals}f}]"
+    interval = f" [{low:+.{decimals}f}, {high:+.{decimals}f}]" if math.isfinite(low) else ""
+    return f"{difference.mean:+.{decimals}f}{interval}"
 
 
 def _word(found: Comparison, sure: bool) -> str:
     if not found.decided:
-        return "one object: no interval"
+        return f"fewer than {FEWEST} objects: no interval"
     if not found.a_beats_b and not found.b_beats_a:
         return "no difference shown"
     text = f"{'A' if found.a_beats_b else 'B'} is better"

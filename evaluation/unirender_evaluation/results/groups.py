@@ -18,7 +18,7 @@ from unirender_evaluation.metrics import METRICS, SCALES, Metric, Variant, metri
 from unirender_evaluation.records import Record
 from unirender_evaluation.results.data import Results
 from unirender_evaluation.results.findings import NOT_RUN, Question, interval_text, label_of, markdown_table
-from unirender_evaluation.statistics import CONFIDENCE, Estimate, mean_estimate
+from unirender_evaluation.statistics import FEWEST, Estimate, mean_estimate, student_half_width
 from unirender_evaluation.tables.formats import MISSING, estimate_text
 
 Number = tuple[str, str]  # quantity, metric
@@ -42,13 +42,11 @@ def contrast(
         clusters_b: of `b`.
 
     Returns:
-        No interval (NaN) where a part has fewer than two clusters.
+        No interval (NaN) where a part has fewer than `statistics.FEWEST` clusters.
 
     Raises:
         UnirenderError: a part is empty or has a value that is not finite, or lengths differ.
     """
-    from scipy.special import stdtrit
-
     parts = ((np.asarray(a, np.float64), list(clusters_a)), (np.asarray(b, np.float64), list(clusters_b)))
     for x, names in parts:
         if not x.size or len(names) != x.size or not np.isfinite(x).all():
@@ -61,9 +59,8 @@ def contrast(
         np.add.at(pulls, [labels[name] for name in names], sign * (x - x.mean()) / x.size)
     mean, fewest = float(parts[0][0].mean() - parts[1][0].mean()), min(len(set(names)) for _, names in parts)
     half = math.nan
-    if fewest > 1:
-        error = math.sqrt(fewest / (fewest - 1) * np.square(pulls).sum())
-        half = float(stdtrit(fewest - 1, (1 + CONFIDENCE) / 2) * error)
+    if fewest >= FEWEST:
+        half = student_half_width(fewest / (fewest - 1) * np.square(pulls).sum(), fewest - 1)
     return Estimate(mean, mean - half, mean + half, len(a) + len(b), len(labels))
 
 

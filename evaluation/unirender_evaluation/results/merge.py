@@ -131,7 +131,7 @@ def merge(files: Sequence[Results]) -> tuple[RunInfo, list[Record]]:
     rows = _told_apart(rows)
     methods = tuple(row.info for row in rows)
     merged = [replace(r, method=row.info.key) for row in rows for r in row.records.values()]
-    # In the order of a run's own records, on which the draws of intervals depend.
+    # In the order of a run's own records, so that sums over them round alike.
     merged.sort(key=lambda r: (r.table, r.protocol, r.method, r.sample))
     return _merged_run([file.run for file in files], methods), merged
 

@@ -177,7 +177,8 @@ def standing_text(results: Results) -> str:
     run, objects = results.run, len({record.object for record in results.records})
     facts = (
         f"`{shipped_for(run.resolution).name}` on `{run.suite}`: {objects} objects, none of them trained on, at "
-        f"{run.resolution} x {run.resolution} pixels ({run.date}). Inside the mask, sRGB, not aligned but for the ball."
+        f"{run.resolution} x {run.resolution} pixels ({run.date}). Inside the mask, sRGB, not aligned but for the "
+        "ball; intervals are over objects, under the suite's lights."
     )
     return f"{against_trivial(results, STANDING)}\n{facts}"
 

@@ -5,10 +5,12 @@ from typing import Any
 
 from unirender_evaluation.comparisons import Lights
 from unirender_evaluation.records import Record, RunInfo
+from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables.formats import MISSING, json_number, json_text
 from unirender_evaluation.tables.latex import tex_needs, tex_row, tex_text
+from unirender_evaluation.tables.specs import PROTOCOLS
 from unirender_evaluation.tables.text import TextTable
-from unirender_evaluation.verdict import HEAD, Finding, ceiling_breaches, judged, summary, verdict_text
+from unirender_evaluation.verdict import HEAD, Finding, ceiling_breaches, judged, scale_said, summary, verdict_text
 
 COLUMNS = ("number", "A", "B", "A - B", "over objects", "under other lights", "n (objects, lights)")
 
@@ -51,22 +53,34 @@ def claims_table(run: RunInfo, records: Sequence[Record], lights: Lights, stated
     """The claims of a run that were compared, a row each; `stated`: and the distances that are only stated."""
     found = judged(records, run, lights)
     shown = [finding for finding in found if finding.comparison is not None and (stated or finding.holds is not None)]
-    rows = tuple(map(_cells, shown))
+    rows = tuple(_cells(run, finding) for finding in shown)
+    summed = summary(records, found, lambda finding: "{}: {} against {}".format(*_names(run, finding)))
     limit = () if run.limit is None else (f"--limit {run.limit}: a partial run, not a result",)
-    notes = (f"{HEAD}.", *(f"{line[0].upper()}{line[1:]}." for line in summary(records, found)), *limit)
+    notes = (f"{HEAD}.", *(f"{line[0].upper()}{line[1:]}." for line in summed), *limit)
     return TextTable(f"Verdict on suite {run.suite}", COLUMNS, (rows,), notes)
 
 
-def _cells(finding: Finding) -> tuple[str, ...]:
+def _names(run: RunInfo, finding: Finding) -> tuple[str, str, str]:
+    """A claim's number and its rows, as tables call them."""
+    claim, spec = finding.claim, ALL_TABLES[finding.claim.table]
+    asked = claim.quantity, claim.metric
+    group = next(column.group for column in spec.columns if (column.quantity, column.metric.name) == asked)
+    title = f"{spec.title}, {PROTOCOLS[claim.protocol].label}"
+    labels = {info.key: info.label for info in run.methods}
+    a, b = (labels.get(key, key) for key in (claim.a, claim.b))  # a row that did not run has no label
+    return f"{title}: {group} {claim.kind.label}{scale_said(claim)}", a, b
+
+
+def _cells(run: RunInfo, finding: Finding) -> tuple[str, ...]:
     claim, compared, over_lights = finding.claim, finding.comparison, finding.over_lights
     if compared is None:
-        return (finding.number, claim.a, claim.b, *[MISSING] * 4)
+        return (*_names(run, finding), *[MISSING] * 4)
     own, unit = compared.difference, f" {claim.kind.unit}" if claim.kind.unit else ""
     alone = f"{finding.word.lower()} [{own.low:+.4g}, {own.high:+.4g}]" if compared.decided else MISSING
     other, counts = finding.other_lights or MISSING, f"{own.n} ({own.clusters}, {finding.lights or MISSING})"
     if over_lights is not None and other not in (MISSING, "not told"):
         other += f" [{over_lights.low:+.4g}, {over_lights.high:+.4g}]"
-    return (finding.number, claim.a, claim.b, f"{own.mean:+.4g}{unit}", alone, other, counts)
+    return (*_names(run, finding), f"{own.mean:+.4g}{unit}", alone, other, counts)
 
 
 def _markdown(run: RunInfo, records: Sequence[Record], lights: Lights) -> str:

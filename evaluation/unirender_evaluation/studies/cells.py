@@ -40,8 +40,8 @@ def cell_text(cell: Cell, decimals: int) -> str:
     if cell.difference is None:
         return text
     change = signed(cell.difference.mean, decimals)
-    if not math.isnan(cell.difference.printed_half_width):
-        change += f" ± {format_number(cell.difference.printed_half_width, decimals)}"
+    if not math.isnan(cell.difference.half_width):
+        change += f" ± {format_number(cell.difference.half_width, decimals)}"
     return f"{text} (**{change}**)" if cell.decided else f"{text} ({change})"
 
 

@@ -143,7 +143,7 @@ def build_table(
         variant=variant,
         columns=spec.columns,
         rows=tuple(rows),
-        protocol=protocol_line(declared, variant, run, methods, chosen, published_in, lights is not None),
+        protocol=protocol_line(declared, variant, run, methods, chosen, spec.columns, published_in, lights is not None),
         notes=table_notes(spec, rows, variant, lights is not None),
         watermark=None if run.limit is None else f"--limit {run.limit}: a partial run, not a result",
         n=total,

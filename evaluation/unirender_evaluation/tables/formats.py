@@ -38,7 +38,7 @@ def format_number(value: float, decimals: int) -> str:
 
 def format_estimate(estimate: Estimate, decimals: int) -> tuple[str, str]:
     """(mean, "± half width"); the second is empty where there is no interval, or one of too few objects to print."""
-    width = estimate.printed_half_width
+    width = estimate.half_width
     return format_number(estimate.mean, decimals), "" if math.isnan(width) else f"± {format_number(width, decimals)}"
 
 

@@ -8,7 +8,7 @@ from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.statistics import CONFIDENCE, CROSSED, METHOD
 from unirender_evaluation.tables.mistakes import mistakes_said, truth_said
 from unirender_evaluation.tables.published import taken_how
-from unirender_evaluation.tables.specs import Protocol
+from unirender_evaluation.tables.specs import Column, Protocol
 
 SPACE_TEXT = {"srgb": "sRGB (clipped to [0, 1], then encoded)", "linear": "linear Rec.709, clipped to [0, 1]"}
 SCALE_TEXT = {
@@ -41,11 +41,22 @@ def protocol_line(
     run: RunInfo,
     methods: Sequence[MethodInfo],
     records: Sequence[Record],
+    columns: Sequence[Column],
     published_in: str | None,
     over_lights: bool = False,
 ) -> tuple[tuple[str, str], ...]:
-    """(what, value) pairs in the order in which they are printed; `published_in`: the table of the paper whose numbers
-    stand beside, None where none do; `over_lights`: whether intervals are over lights, too."""
+    """(what, value) pairs in the order in which they are printed.
+
+    Args:
+        protocol: what a method is given.
+        variant: how numbers are taken.
+        run: describes suite, truth and code.
+        methods: the rows.
+        records: of the table.
+        columns: of the table.
+        published_in: the table of the paper whose numbers stand beside; None where none do.
+        over_lights: whether intervals are over lights, too.
+    """
     spp = protocol.truth or f"{'-' if run.truth_spp is None else run.truth_spp} spp"
     samples, objects = ({getattr(record, name) for record in records} for name in ("sample", "object"))
     frame = [
@@ -54,6 +65,7 @@ def protocol_line(
         ("colour", SPACE_TEXT[variant.space]),
         ("scale alignment", SCALE_TEXT[variant.scale]),
     ]
+    has_lpips = any(column.metric.name.startswith("lpips_") for column in columns)
     coverage = "-" if run.coverage is None or protocol.truth else f"{run.coverage:.3f}"
     items = [
         ("given", protocol.given),
@@ -64,7 +76,7 @@ def protocol_line(
         *([("coverage", coverage)] if protocol.framed else []),
         ("steps x samples", _sampling_text(methods)),
         ("seeds", ", ".join(map(str, run.seeds)) or "-"),
-        *([("LPIPS", _lpips_text(variant, run))] if protocol.framed else []),
+        *([("LPIPS", _lpips_text(variant, run))] if has_lpips else []),
         ("interval", CROSSED if over_lights else f"{CONFIDENCE:.0%} over objects, under these lights: {METHOD}"),
         ("suite", f"{run.suite} {run.suite_hash[:12]}"),
         ("truth", f"Mitsuba {run.mitsuba or '-'}, {spp}{f', unchecked ({run.unchecked})' if run.unchecked else ''}"),

@@ -61,7 +61,6 @@ def test_the_rows_of_a_study_have_names_of_their_own_and_the_groups_that_have_a_
 
 
 def test_notes_say_how_intervals_are_made() -> None:
-    """A bootstrap of a few objects would be too narrow, and nothing else tells which it was."""
     notes = (
         sampling_tables.QUALITY_NOTE,
         training_tables.NOTE,

@@ -55,7 +55,7 @@ def _steps_panel(axes: Any, records: Sequence[Record], settings: Sequence[Settin
         axes.errorbar(
             [steps * ASIDE ** (index - (len(counts) - 1) / 2) for steps, _ in points],
             [found.mean for _, found in points],
-            yerr=[0.0 if math.isnan(found.printed_half_width) else found.printed_half_width for _, found in points],
+            yerr=[0.0 if math.isnan(found.half_width) else found.half_width for _, found in points],
             color=COLOURS[min(index, len(COLOURS) - 1)],
             marker="o",
             markersize=4,
