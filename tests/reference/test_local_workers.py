@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from unirender.errors import UnirenderError
-from unirender.worker_pool import WorkerPool
+from unirender.system.worker_pool import WorkerPool
 from unirender_reference.processes import time_limit
 from unirender_reference.workers import LocalWorkers, WorkerDied
 
