@@ -8,6 +8,7 @@ gives equal bytes.
 """
 
 import io
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from unirender.picture_files.primaries import in_rec709
 from unirender.system.whole_files import is_special, replace_file
 
 Channels = dict[str, Float[np.ndarray, "h w"]]
+COMBINED = re.compile(r"(^|\.)Combined\.R$")  # what a layer of Blender's calls the red of its picture
 
 HALF_MAX = 65504.0
 HALF_FULL = 2.0**-10  # half precision has all its digits down to 2^-14: of radiance that ends below, too few are left
@@ -133,7 +135,8 @@ def exr_bytes(
 def read_exr(path: str | Path) -> tuple[Channels, dict[str, str]]:
     """Channels `[h w]` (float32) by name, and the string attributes (`unirender:` removed) of a file.
 
-    Colours of a file that states other primaries come in Rec.709 (`unirender.picture_files.primaries`).
+    Colours of a file that states other primaries come in Rec.709 (`unirender.picture_files.primaries`). The picture of
+    Blender's layer, `ViewLayer.Combined.R` and so on, is R, G, B and A where a file has one such layer and no R.
 
     Raises:
         UnirenderError: the file is missing, a pipe, no readable single-part OpenEXR, or stores pixels of another part
@@ -171,7 +174,7 @@ def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[
     try:
         file = OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0)
         parts = len(file.parts)
-        stored_channels, header = file.channels(), file.header()
+        stored_channels, header = _named(file.channels()), file.header()
         _check_stored(stored_channels, header, name)
         channels = {key: np.asarray(channel.pixels, dtype=np.float32) for key, channel in stored_channels.items()}
     except UnirenderError:
@@ -195,6 +198,13 @@ def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[
         channels = in_rec709(channels, header["chromaticities"], COLORS, name)
     attributes = {key.removeprefix(ATTRIBUTE_PREFIX): value for key, value in header.items() if isinstance(value, str)}
     return channels, attributes
+
+
+def _named(channels: Mapping[str, OpenEXR.Channel]) -> dict[str, OpenEXR.Channel]:
+    """The channels, those of the one combined picture by their last letter."""
+    layers = {name[:-1] for name in channels if COMBINED.search(name)}
+    layer = layers.pop() if len(layers) == 1 and "R" not in channels else ""
+    return {name.removeprefix(layer): channel for name, channel in channels.items()}
 
 
 def _check_stored(channels: Mapping[str, OpenEXR.Channel], header: Mapping[str, object], name: str) -> None:

@@ -50,7 +50,7 @@ MISTAKES: Mapping[str, Mistake] = {  # by the name of the metric that has the ga
     "if_shifted": Mistake("moved by one pixel (cropped or resampled by other rules?)", PLACE),
     "if_turned": Mistake("turned by half a turn (its middle is behind the camera)", PLACE),
     "if_inverted": Mistake("taken for 1 minus it (smoothness?)", TONE),
-    "if_root": Mistake("as its square root (the GGX alpha?)", TONE),
+    "if_root": Mistake("as its square root (the GGX alpha, or too low throughout?)", TONE),
     "if_swapped": Mistake("exchanged with metallic", TONE),
 }
 GAINS: Mapping[str, Metric] = {

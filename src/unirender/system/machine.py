@@ -95,8 +95,7 @@ def _group_limits(swap: float) -> list[float]:
         inner = root / path.lstrip("/")  # which is not there inside of a container: `root` is its own group then
         for folder in (inner, *inner.parents):
             limit, more = (_number(folder / name) for name in LIMITS[version])
-            if folder.is_relative_to(root) and math.isfinite(limit):
-                limits.append(min(limit + swap, more if version == 1 else limit + more))
+            limits.append(min(limit + swap, more if version == 1 else limit + more))
     return limits
 
 

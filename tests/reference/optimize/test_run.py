@@ -50,7 +50,7 @@ def values(out: Path) -> list[tuple]:
 def killed(out: Path, at: int) -> None:
     """Begins the run in a process of its own, and kills it once its history has `at` lines."""
     helper = Path(optimizer_runs.__file__)
-    environment = {**os.environ, "PYTHONPATH": str(helper.parent)}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(helper.parent), *sys.path])}
     process = subprocess.Popen([sys.executable, str(helper), str(out)], env=environment)
     history, deadline = out / HISTORY, time.monotonic() + 120
     while time.monotonic() < deadline and process.poll() is None:
