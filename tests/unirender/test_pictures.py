@@ -293,13 +293,13 @@ def test_exr_is_unpremultiplied_and_encoded(tmp_path: Path) -> None:
 
 
 def test_the_combined_picture_of_a_layer_is_read(tmp_path: Path) -> None:
-    path, half = tmp_path / "render.exr", np.full((4, 4), 0.5, np.float32)
-    layer = {f"ViewLayer.Combined.{name}": half * (name != "B") for name in "RGBA"}
-    write_exr(path, {**layer, "ViewLayer.Depth.Z": half, "ViewLayer.DiffCol.R": 0 * half})
+    path, light = tmp_path / "render.exr", np.full((4, 4), 0.75, np.float32)
+    layer = {f"ViewLayer.Combined.{name}": light * (name != "B") for name in "RGBA"}
+    write_exr(path, {**layer, "ViewLayer.Depth.Z": light, "ViewLayer.DiffCol.R": 0 * light})
     picture = read_picture(path)
     assert picture.mask is not None
-    assert np.allclose(picture.image_srgb[0, 0], [1, 1, 0])  # straight: premultiplied 0.5 of coverage 0.5
-    assert np.allclose(picture.mask, 0.5)
+    assert np.allclose(picture.image_srgb[0, 0], [1, 1, 0])  # straight: premultiplied 0.75 of coverage 0.75
+    assert np.allclose(picture.mask, 0.75)
     write_exr(path, {**layer, **{name.replace("View", "Other"): value for name, value in layer.items()}})
     with pytest.raises(UnirenderError, match="rename those of the layer"):
         read_picture(path)
