@@ -287,12 +287,12 @@ def test_a_plug_in_whose_light_cannot_be_scored_is_named(suite: Suite, light: np
     assert answer(make_row(Light(lamp(0, 1, 0)), "external"), first(suite)).maps is not None
 
 
-def test_the_verdict_says_which_numbers_of_a_light_are_aligned(suite: Suite) -> None:
+def test_the_verdict_says_which_numbers_of_a_light_are_aligned() -> None:
     records = []
-    for i, scene in enumerate(suite.scenes):
+    for i in range(3):
         for key, x in (("ours-mean", 0.2), ("mean-light", 0.5)):
             values = {RAW: x + 0.01 * i, ALIGNED: x / 2 + 0.01 * i}
-            records.append(Record("light", "light-from-image", key, scene.key, f"o{i}", values))
+            records.append(Record("light", "light-from-image", key, f"o{i}_l0", f"o{i}", values))
     lines = [str(finding) for finding in findings(records, light_claims("ours-mean"))]
     aligned = next(line for line in lines if "ball_matte error (aligned)" in line and "mean-light" in line)
     raw = next(line for line in lines if "ball_matte error (raw)" in line and "mean-light" in line)

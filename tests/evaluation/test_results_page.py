@@ -27,9 +27,9 @@ def test_no_question_is_asked_twice() -> None:
 
 
 def test_a_table_is_markdown_and_the_correction_counts_its_lines(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two objects that differ alike: p is 0."""
+    """Three objects that differ alike: p is 0."""
     monkeypatch.setattr(page_module, "SECTIONS", {"one": Section((ALBEDO,))})
-    assert "| **A is better** | 2 of 2 (4) |" in page.table("one").replace("\N{NO-BREAK SPACE}", " ")
+    assert "| **A is better** | 3 of 3 (4) |" in page.table("one").replace("\N{NO-BREAK SPACE}", " ")
     assert page.table("one")._repr_markdown_() == str(page.table("one"))
     assert page.correction() == "Of 1 lines 1 say that a row is better; in 1 of them that is **bold**."
 

@@ -206,7 +206,7 @@ def test_colours_by_hand() -> None:
                     f"ssim@whole-{space}-{scale}": ssim(shown(white(p, own)), shown(white(t, w))),
                 }
                 found = {key: values[f"{name}.{key}"] for key in expected}
-                assert found == pytest.approx(expected, rel=1e-6), name
+                assert found == pytest.approx(expected, rel=1e-6, abs=1e-7), name
                 assert len(set(found.values())) == 4
             kind, distance = ("ciede2000", metrics.ciede2000) if name == "albedo" else ("log_rmse", metrics.log_rmse)
             assert values[f"{name}.{kind}@{scale}"] == pytest.approx(distance(p, t, w), rel=1e-6)
