@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from unirender_evaluation.claims import CEILING, OUR_CLAIMS, Claim, run_claims
 from unirender_evaluation.comparisons import Comparison, Lights, Selection, compare, difference_over_lights, values_of
 from unirender_evaluation.records import Record, RunInfo
-from unirender_evaluation.statistics import Estimate, holm, light_count, paired_difference, paired_p_value
+from unirender_evaluation.statistics import FEWEST, Estimate, holm, light_count, paired_difference, paired_p_value
 from unirender_evaluation.task import LIGHT
 
-FEW = 20  # objects or lights, of fewer of which what is not shown is open
+FEW = 20  # objects or lights: a claim that is not shown of fewer is open, of as many it fails
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,10 @@ def ceiling_breaches(records: Sequence[Record]) -> list[CeilingBreach]:
 
 
 def _no_breach(records: Sequence[Record]) -> str:
-    if any(record.method == CEILING for record in records):
+    bound = [record for record in records if record.method == CEILING]
+    if bound and len({record.object for record in bound}) < FEWEST:
+        return f"  open   noise ceiling: nothing is told of fewer than {FEWEST} objects"
+    if bound:
         return "  HOLDS  no measured row exceeds the noise ceiling by more than its interval"
     return "  open   noise ceiling: these results have no row of it, which a row could exceed"
 
@@ -205,7 +208,9 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, li
     lines += [f"  ({line})" for line in summary(records, found)]
     breaches = ceiling_breaches(records)
     lines += [f"  FAILS  {breach}" for breach in breaches] or [_no_breach(records)]
-    lines += _truth_lines(check) if check else ["  open   truth: what its check found stands in the run's verdict.txt"]
+    told = "what its check found stands in the run's verdict.txt"
+    unknown = f"not rendered again ({run.unchecked})" if run.unchecked else told
+    lines += _truth_lines(check) if check else [f"  open   truth: {unknown}"]
     if run.limit is not None:
         lines.append(f"  (--limit {run.limit}: a partial run, not a result)")
     return "\n".join(lines)
@@ -235,7 +240,7 @@ def summary(records: Sequence[Record], found: Sequence[Finding], named: Named = 
 
 def _corrected_lines(records: Sequence[Record], found: Sequence[Finding], named: Named) -> list[str]:
     """How many of the claims that hold would do so if all claims were one question; nothing where none holds."""
-    claimed = [finding for finding in found if finding.holds is not None]
+    claimed = [f for f in found if f.holds is not None and f.comparison is not None and f.comparison.decided]
     sure = holm([_p_value(records, finding.claim) for finding in claimed])
     holding = [(f, certain) for f, certain in zip(claimed, sure, strict=True) if f.holds]
     if not holding:

@@ -66,6 +66,8 @@ class Camera:
             raise UnirenderError(
                 f"focal length: got {focal:g} pixels in a picture of {width} x {height}, expected numbers above 0"
             )
+        if center is not None and np.shape(center) != (2,):
+            raise UnirenderError(f"center: got {center!r}, expected (x, y) in pixels; sides are height, width")
         x, y = (width / 2, height / 2) if center is None else center
         return cls(math.degrees(2 * math.atan(height / (2 * focal))), (x / width, y / height))
 

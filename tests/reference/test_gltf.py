@@ -621,16 +621,18 @@ def test_what_is_scaled_to_nothing_takes_no_room(tmp_path):
 
 
 @pytest.mark.parametrize("normalized", [False, True])
-def test_colors_that_are_bytes_are_of_255(tmp_path, normalized):
-    """Also where their accessor does not say `normalized`, which the specification asks for: 51 is no white."""
+@pytest.mark.parametrize(("kind", "white"), [(np.uint8, 255), (np.uint16, 65535)])
+def test_colors_that_are_whole_numbers_are_of_their_type(tmp_path, normalized, kind, white):
+    """Also where their accessor does not say `normalized`, which the specification asks for; and dark ones, too."""
 
     def fill(w: GltfWriter) -> None:
         quad = w.quad(None)
-        quad["attributes"]["COLOR_0"] = w.accessor(np.tile(np.array([[51, 0, 255, 255]], np.uint8), (4, 1)), normalized)
+        color = np.array([[51, 0, 255, white]], kind)
+        quad["attributes"]["COLOR_0"] = w.accessor(np.tile(color, (4, 1)), normalized)
         w.mesh(quad)
 
     albedo = load_mesh(quad_glb(tmp_path, fill)).albedo.reshape(-1, 3)
-    assert albedo == pytest.approx(np.tile([0.2, 0, 1], (len(albedo), 1)), abs=1e-6)
+    assert albedo == pytest.approx(np.tile(np.array([51, 0, 255]) / white, (len(albedo), 1)), abs=1e-6)
 
 
 @pytest.mark.parametrize("normals", [False, True])

@@ -62,6 +62,7 @@ for case in %r:
 CASES = {
     "pipeline.decompose(image, mask, mode='sample', num_samples=2.5)": "num_samples: got 2.5, expected a whole number",
     "pipeline.decompose(image, mask, mode='sample', num_inference_steps='3')": "num_inference_steps: got '3', expected",
+    "Camera.from_focal(500, 500, 640, 480)": "center: got 480, expected (x, y) in pixels; sides are height, width",
     "pipeline.decompose(image, mask, generator=3)": "generator: got 3, expected a torch.Generator",
     "pipeline.decompose(image, mask, generator=[3])": "generator: got 3, expected a torch.Generator",
     "pipeline.decompose(image, mask, generator='3')": "generator: got '3', expected a torch.Generator",

@@ -129,7 +129,8 @@ def _arguments(found: Any, query: str, what: str) -> dict[str, Any]:
         if name in arguments:
             raise UsageError(f"{what}: {name} is given twice, expected once")
         if name not in taken:
-            raise UsageError(f"{what}: no argument {name!r}, expected some of {', '.join(taken) or 'none'}")
+            expected = f"some of {', '.join(taken)}" if taken else "nothing behind its name: it takes no arguments"
+            raise UsageError(f"{what}: no argument {name!r}, expected {expected}")
         arguments[name] = _value(unquote(text), taken[name].annotation, f"{what}: {name}")
     return arguments
 

@@ -86,22 +86,22 @@ def coverage(
     return float(held[0] / trials), float(held[1] / trials)
 
 
-def stored_numbers(results: Results) -> dict[str, list[Objects]]:
-    """What the claims of a run are about, of those on all of its objects: the differences of A and B, and what A has
-    itself. Rows that are level, and answers that are the truth to the bit, are left out."""
+def stored_differences(results: Results) -> list[Objects]:
+    """What the claims of a run are about, of those on all of its objects: the differences of A and B. Rows that are
+    level, and answers that are the truth to the bit, are left out."""
     count = len({record.object for record in results.records})
-    found: dict[str, list[Objects]] = {"A - B": [], "A": []}
+    found: list[Objects] = []
     for claim in run_claims(results.records, results.run):
         records = Selection(claim.table, claim.protocol).of(results.records)
         a, b = (values_of(records, row, claim.key) for row in (claim.a, claim.b))
         object_of = {record.sample: record.object for record in records}
-        of_object: dict[str, list[tuple[float, float]]] = {}
+        of_object: dict[str, list[float]] = {}
         for sample in sorted(a.keys() & b.keys()):
-            of_object.setdefault(object_of[sample], []).append((a[sample] - b[sample], a[sample]))
-        pairs = [np.array(own) for own in of_object.values()]
-        if len(pairs) == count and np.isfinite(np.concatenate(pairs)).all() and any(own[:, 0].any() for own in pairs):
-            found["A - B"].append([own[:, 0] for own in pairs])
-            found["A"].append([own[:, 1] for own in pairs])
+            of_object.setdefault(object_of[sample], []).append(a[sample] - b[sample])
+        differences = [np.array(own) for own in of_object.values()]
+        together = np.concatenate(differences)
+        if len(differences) == count and np.isfinite(together).all() and together.any():
+            found.append(differences)
     return found
 
 
@@ -150,15 +150,13 @@ def lights_table(structures: Mapping[str, Samples]) -> str:
 
 
 def draws_table(results: Results, counts: Sequence[int] = COUNTS, draws: int = DRAWS) -> str:
-    """Coverage by how many objects of stored results are drawn, Student's t / bootstrap, in percent: the mean over the
-    numbers that claims are about, and the number whose intervals hold it least often."""
-    lines = []
-    for name, numbers in stored_numbers(results).items():
-        held = [[coverage_of_draws(objects, count, draws) for count in counts] for objects in numbers]
-        shares = 100 * np.array(held)  # (numbers, counts, 2)
-        for word, percent in (("mean", shares.mean(axis=0)), ("least", shares.min(axis=0))):
-            cells = (f"{student:.1f} / {resampled:.1f}" for student, resampled in percent)
-            lines.append([f"{name}, {len(numbers)} numbers: {word}", *cells])
+    """Coverage by how many objects of stored results are drawn, in percent: the mean over the differences that claims
+    are about, Student's t / bootstrap, and Student's of the one that it holds least often."""
+    found = stored_differences(results)
+    held = 100 * np.array([[coverage_of_draws(objects, count, draws) for count in counts] for objects in found])
+    means = [f"{student:.1f} / {resampled:.1f}" for student, resampled in held.mean(axis=0)]
+    least = [f"{student:.1f}" for student in held[:, :, 0].min(axis=0)]
+    lines = [[f"mean of {len(found)} differences", *means], ["the least of them, Student's t", *least]]
     return markdown_table([f"objects of {results.run.suite}", *map(str, counts)], lines)
 
 

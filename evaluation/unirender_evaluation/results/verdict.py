@@ -76,7 +76,7 @@ def _cells(run: RunInfo, finding: Finding) -> tuple[str, ...]:
     if compared is None:
         return (*_names(run, finding), *[MISSING] * 4)
     own, unit = compared.difference, f" {claim.kind.unit}" if claim.kind.unit else ""
-    alone = f"{finding.word.lower()} [{own.low:+.4g}, {own.high:+.4g}]" if compared.decided else MISSING
+    alone = finding.word.lower() + (f" [{own.low:+.4g}, {own.high:+.4g}]" if compared.decided else "")
     other, counts = finding.other_lights or MISSING, f"{own.n} ({own.clusters}, {finding.lights or MISSING})"
     if over_lights is not None and other not in (MISSING, "not told"):
         other += f" [{over_lights.low:+.4g}, {over_lights.high:+.4g}]"

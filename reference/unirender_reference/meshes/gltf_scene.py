@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from unirender.errors import UnirenderError
-from unirender_reference.meshes.colors import unit_colors
 from unirender_reference.meshes.folder import ModelFolder
 from unirender_reference.meshes.gltf_accessors import DRACO, accessor_count, read_accessor, read_draco
 from unirender_reference.meshes.gltf_document import Document
@@ -127,7 +126,7 @@ class _Shape:
         colors = self._attribute(names, "COLOR_0", 3, 4)
         self._colors = None
         if colors is not None and colors.dtype.kind in "iu":  # not marked as normalised, which colours have to be
-            self._colors = unit_colors(colors)[self.faces]
+            self._colors = np.clip(colors[:, :3] / np.iinfo(colors.dtype).max, 0, 1)[self.faces]
         elif colors is not None:
             self._colors = np.clip(np.nan_to_num(colors[:, :3].astype(np.float64)), 0, 1)[self.faces]
         self._material = materials.of(material, frozenset(self._uv))

@@ -94,7 +94,7 @@ class DualStreamPipeline(DiffusionPipeline):
             raise UnirenderError("dual_stream: got None, expected a DualStreamModel; leave the argument out")
         old_name = kwargs.pop("torch_dtype", None)  # diffusers calls it `dtype` now; both work here
         kwargs = {"dtype": old_name or torch.float32, "use_safetensors": True} | kwargs
-        with reading(path):
+        with reading(path, given=bool(kwargs.keys() - {"dtype", "use_safetensors"})):
             pipeline = super().from_pretrained(str(path), **kwargs)
         check_options(pipeline, path / INDEX_FILE)
         if "dual_stream" not in kwargs:

@@ -48,8 +48,12 @@ def find_pipeline(checkpoint: str | Path | None) -> Path:
 
 
 @contextlib.contextmanager
-def reading(path: Path) -> Iterator[None]:
+def reading(path: Path, given: bool = False) -> Iterator[None]:
     """What goes wrong while a pipeline folder is read is an error about the folder, but for too little memory.
+
+    Args:
+        path: of the folder.
+        given: the caller's own settings take the place of some; what is wrong may be one of them.
 
     Raises:
         UnirenderError: anything did.
@@ -60,6 +64,8 @@ def reading(path: Path) -> Iterator[None]:
     except MemoryError:
         raise
     except UnirenderError as error:  # of what is built, which knows no files
+        if given:
+            raise
         raise UnirenderError(f"{path}: {error}") from error
     except Exception as error:  # diffusers and safetensors raise half a dozen kinds for a broken file
         if out_of_memory(error):

@@ -26,9 +26,10 @@ def replace_file(path: Path, content: str | bytes) -> Path:
     """
     data = content if isinstance(content, bytes) else content.encode()
     if is_special(path):
-        path.write_bytes(data)
+        with naming(path):
+            path.write_bytes(data)
         return path
-    place = path.resolve()
+    place = Path(os.path.realpath(path))  # of a link to itself, too: `resolve` raises what is no OSError
     if place.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     place.parent.mkdir(parents=True, exist_ok=True)
