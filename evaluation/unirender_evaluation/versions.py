@@ -85,8 +85,19 @@ COMMANDS = (
     "validation",
 )
 FROM_RECORDS = ("claims", "comparisons", "statistics", "table_list", "verdict")
-# Of the shared vocabulary's folder: the docstrings of its packages, the command line, names of checkpoints, processes.
-OUTSIDE = ("*/__init__", "__main__", "cli", "shipped", "system/worker_pool")
+# Of the shared vocabulary's folder: the docstrings of its packages, the command line, names of checkpoints, processes,
+# and what is said of errors.
+OUTSIDE = (
+    "*/__init__",
+    "__main__",
+    "cli",
+    "shipped",
+    "system/ends",
+    "system/notices",
+    "system/system_errors",
+    "system/worker_pool",
+    "system/writing",
+)
 # The rooms that records are made in, and of the tables what is asked. Results and the report are made from records.
 ROOMS = ("*.py", "methods/*.py", "physics/*.py", "predictions/*.py", "runs/*.py", "suites/*.py", "truth/*.py")
 QUESTIONS = "tables/specs.py"

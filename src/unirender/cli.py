@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from unirender.command_line.commands import Decompose, Edit, Relight, Render
-from unirender.command_line.notices import NoticeHandler, notice
-from unirender.command_line.parse import Ended, causes, interrupted, parse
+from unirender.command_line.parse import parse
 from unirender.command_line.process_ends import (
     READER_LEFT,
     drop_output,
@@ -33,8 +32,10 @@ from unirender.command_line.process_ends import (
     quick_start,
     reader_left,
 )
-from unirender.command_line.system_errors import out_of_memory, refused_by_system
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.ends import Ended, causes, interrupted
+from unirender.system.notices import NoticeHandler, notice
+from unirender.system.system_errors import out_of_memory, refused_by_system
 from unirender.training.after.average import Average
 from unirender.training.after.calibrate import Calibrate
 from unirender.training.command import Train
@@ -78,10 +79,10 @@ class Doctor:
         from rich.text import Text
 
         import unirender
-        from unirender.command_line.writing import unusable
         from unirender.models.precision import resolve_device, resolve_dtype
         from unirender.shipped import shipped_names
         from unirender.system.paths import cache_dir
+        from unirender.system.writing import unusable
         from unirender_evaluation.lpips import available
         from unirender_reference.backend import doctor
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from unirender.command_line.writing import writing
 from unirender.errors import UnirenderError
+from unirender.system.writing import writing
 from unirender_reference.checks.command import Check
 from unirender_reference.measure.census_command import Census
 from unirender_reference.measure.contact_sheet import Sheet

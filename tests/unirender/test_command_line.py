@@ -18,9 +18,9 @@ from optimizer_runs import rendered_views, truth
 
 from unirender import cli
 from unirender.command_line import process_ends
-from unirender.command_line.parse import Ended, causes, interrupted
 from unirender.command_line.process_ends import open_streams
-from unirender.command_line.system_errors import refused_by_system
+from unirender.system.ends import Ended, causes, interrupted
+from unirender.system.system_errors import refused_by_system
 from unirender.visualization import write_png
 from unirender_reference.optimize.files.export import write_solution
 from unirender_reference.optimize.files.folder import write_views

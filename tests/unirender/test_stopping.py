@@ -13,8 +13,7 @@ from tiny_models import TRAIN, make_batch
 from torch import Tensor
 
 from unirender import cli
-from unirender.command_line.parse import Ended
-from unirender.command_line.process_ends import SIGNALS
+from unirender.system.ends import SIGNALS, Ended
 from unirender.training.config import RunConfig
 from unirender.training.loop import stopping
 from unirender.training.loop.checkpoint import load_state

@@ -17,12 +17,12 @@ from seen_shapes import CAMERA, ball, gutter
 from synthetic_shards import write_shard
 
 from unirender import cli
-from unirender.command_line.process_ends import SIGNALS
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import exr_bytes, intrinsics_channels
 from unirender.intrinsics import Intrinsics
 from unirender.light.lobes import texel_directions
 from unirender.models.visibility import CLASSES, VisibilityNet, bin_weights
+from unirender.system.ends import SIGNALS
 from unirender.training.loop import checkpoint
 from unirender.training.loop.checkpoint import load_state
 from unirender.training.shadows.command import TrainVisibility, rate, split, train_visibility

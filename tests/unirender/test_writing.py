@@ -15,8 +15,8 @@ from tiny_models import TRAIN, make_pipeline
 from torch import nn
 
 from unirender import cli
-from unirender.command_line.writing import unusable, writing
 from unirender.errors import UnirenderError
+from unirender.system.writing import unusable, writing
 from unirender.training.after.average import Average
 from unirender.training.config import RunConfig
 from unirender.training.logs.run_log import RunLog

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import tyro
 
-from unirender.command_line.notices import notice
 from unirender.command_line.option_checks import at_least
 from unirender.command_line.options import Device
-from unirender.command_line.writing import check_out
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.notices import notice
+from unirender.system.writing import check_out
 
 if TYPE_CHECKING:
     from unirender.pictures import Picture

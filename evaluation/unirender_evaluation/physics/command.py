@@ -5,8 +5,8 @@ from pathlib import Path
 
 from unirender.command_line.option_checks import at_least
 from unirender.command_line.options import Device
-from unirender.command_line.writing import check_out
 from unirender.errors import UnirenderError
+from unirender.system.writing import check_out
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from unirender.command_line.writing import unusable, writing
 from unirender.errors import UnirenderError
 from unirender.system.whole_files import is_special
+from unirender.system.writing import unusable, writing
 
 if TYPE_CHECKING:
     from PIL import Image

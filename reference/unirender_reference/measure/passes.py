@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from unirender.command_line.writing import writing
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.writing import writing
 from unirender_reference.measure.output import ELSEWHERE
 
 if TYPE_CHECKING:

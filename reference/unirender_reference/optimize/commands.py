@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from unirender.command_line.writing import writing
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.writing import writing
 from unirender_reference.measure.output import ELSEWHERE, full_disk
 from unirender_reference.optimize.machine import require_cores
 from unirender_reference.optimize.multiview.config import OptimizeConfig

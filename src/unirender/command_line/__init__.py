@@ -1,1 +1,1 @@
-"""The commands that run the model, and how a command is read, speaks and ends. Light to import."""
+"""The commands that run the model, and how a command is read and ends. Light to import."""

@@ -17,7 +17,6 @@ from unirender.command_line.input_picture import (
     RENDERED_BYTES_A_PIXEL,
     memory_remarks,
 )
-from unirender.command_line.notices import notice
 from unirender.command_line.options import DecompositionOptions, InputOptions, ModelOptions, OutputOptions
 from unirender.command_line.remarks import (
     at_white,
@@ -29,6 +28,7 @@ from unirender.command_line.remarks import (
     with_frame_remarks,
 )
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.notices import notice
 
 if TYPE_CHECKING:
     import numpy as np

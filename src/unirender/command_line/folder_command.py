@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unirender.command_line.input_picture import read_input
-from unirender.command_line.notices import notice
 from unirender.command_line.remarks import frame_remarks
 from unirender.errors import UnirenderError
 from unirender.files import SUMMARY_FILE
@@ -17,6 +16,7 @@ from unirender.frames import temporal_difference
 from unirender.pictures import Picture
 from unirender.pipelines.inputs import as_picture
 from unirender.pipelines.results import Decomposition
+from unirender.system.notices import notice
 
 if TYPE_CHECKING:
     from unirender.command_line.commands import Decompose

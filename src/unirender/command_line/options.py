@@ -14,9 +14,9 @@ from unirender.command_line.input_picture import (
     TILED_SAMPLE_BYTES_A_PIXEL,
     read_input,
 )
-from unirender.command_line.notices import notice
 from unirender.command_line.option_checks import at_least, usage
 from unirender.errors import UsageError
+from unirender.system.notices import notice
 
 if TYPE_CHECKING:
     import torch

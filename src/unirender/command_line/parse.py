@@ -12,6 +12,7 @@ import docstring_parser
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.ends import causes
 
 OPTION = re.compile(r"(?<![\w.-])--[a-z][\w.-]*")
 BORDER = "\N{BOX DRAWINGS LIGHT VERTICAL}"  # of the boxes of a help, where a stream can print it
@@ -133,19 +134,3 @@ def _asked(commands: Any, words: Sequence[str], prog: str) -> tuple[str, list[st
             heads = [cell[1:].split("  ")[0] for cell in cells if cell[1:2] == "-"]  # not the prose
             return path, sorted({"--help", *OPTION.findall(" ".join(heads))})
         names.pop()
-
-
-class Ended(KeyboardInterrupt):
-    """The signal `args[0]` came."""
-
-
-def interrupted(error: BaseException) -> bool:
-    """Whether an error is Ctrl-C, or comes of it: Dr.Jit's loops wrap it."""
-    return any(isinstance(cause, KeyboardInterrupt) for cause in causes(error))
-
-
-def causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An error, what it came of, and so on back to the first."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__

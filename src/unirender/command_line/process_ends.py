@@ -13,14 +13,11 @@ import time
 from collections.abc import Iterator
 from types import FrameType
 
-from unirender.command_line.parse import Ended
 from unirender.models.lean_imports import lean_imports
+from unirender.system.ends import PASSED_ON_S, SIGNALS, Ended
 
 OBJECTS = 50_000  # new ones, after which Python looks for unused cycles of them
 WAIT_S, MOST_WAITS = 0.05, 200  # of a signal, for the end of an import: ten seconds in all
-PASSED_ON_S = 2.0  # seconds in which a signal may come again by another way: `timeout` tells a process and its group
-HANG_UP: int = getattr(signal, "SIGHUP", 0)  # 0, which is no signal: Windows has none
-SIGNALS: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, *filter(None, [HANG_UP]))
 READER_LEFT = 141  # exit status: as a shell reports SIGPIPE
 
 

@@ -6,8 +6,8 @@ import dataclasses
 from typing import TYPE_CHECKING, Any
 
 from unirender.command_line.input_picture import MANY_CLIPPED
-from unirender.command_line.notices import notice
 from unirender.errors import UsageError
+from unirender.system.notices import notice
 
 if TYPE_CHECKING:
     import numpy as np

@@ -11,11 +11,11 @@ import torch
 from diffusers.configuration_utils import ConfigMixin, FrozenDict
 from safetensors import SafetensorError, safe_open
 
-from unirender.command_line.system_errors import out_of_memory
 from unirender.errors import UnirenderError
 from unirender.models.config import GONE
 from unirender.models.diffusers_folder import one_line
 from unirender.shipped import checkpoint_folder, shipped_names
+from unirender.system.system_errors import out_of_memory
 
 INDEX_FILE = "model_index.json"
 PLACE = "_name_or_path"  # in the configuration of what diffusers has read

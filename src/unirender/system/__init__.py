@@ -1,1 +1,1 @@
-"""What the machine has, where files lie, files that are whole, and processes that work together."""
+"""The machine: what it has and refuses, where files lie and are whole, processes and their ends; notices."""

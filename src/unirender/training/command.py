@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from unirender.command_line.option_checks import check_seed, usage
 from unirender.command_line.options import Device, DType
-from unirender.command_line.writing import check_out
 from unirender.errors import UnirenderError, UsageError
 from unirender.models.config import ENVIRONMENT_SIZE
 from unirender.system.paths import cache_dir
+from unirender.system.writing import check_out
 from unirender.training.config import TrainConfig
 from unirender.training.config_check import check_config
 from unirender.training.presets import get_preset

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from unirender.command_line.notices import notice
 from unirender.errors import UsageError
+from unirender.system.notices import notice
 from unirender.training.command import Alone, Train
 from unirender.training.config import RunConfig, TrainConfig
 from unirender.training.presets import PRESETS

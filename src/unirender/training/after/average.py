@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from unirender.command_line.notices import notice
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.notices import notice
 
 if TYPE_CHECKING:
     import torch
@@ -96,10 +96,10 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
     import diffusers
     import torch
 
-    from unirender.command_line.writing import writing
     from unirender.files import new_folder
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
     from unirender.shipped import checkpoint_folder
+    from unirender.system.writing import writing
     from unirender.training.loop.card import CARD_FILE, card_text
     from unirender.training.loop.export import TRAINING_FILE, read_history, save_weights
 

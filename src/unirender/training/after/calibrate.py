@@ -12,9 +12,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unirender.command_line.notices import notice
 from unirender.command_line.option_checks import at_least
 from unirender.errors import UnirenderError
+from unirender.system.notices import notice
 
 if TYPE_CHECKING:
     import numpy as np
@@ -73,12 +73,12 @@ def calibrate(options: Calibrate) -> "dict[str, Line]":
     """
     import diffusers
 
-    from unirender.command_line.writing import writing
     from unirender.files import new_folder
     from unirender.models.precision import resolve_device
     from unirender.pipelines.calibration import NAMES
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
     from unirender.shipped import checkpoint_folder
+    from unirender.system.writing import writing
     from unirender.training.after.calibration_line import LEAST_OBJECTS, fit
     from unirender.training.data.dataset import GroupDataset
     from unirender.training.data.same_objects import objects_of

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from unirender.command_line.writing import writing
 from unirender.system.whole_files import whole_file
+from unirender.system.writing import writing
 from unirender.training.logs.live import Report
 from unirender.training.optim.processes import Processes
 

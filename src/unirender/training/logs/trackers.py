@@ -17,8 +17,8 @@ from typing import Any
 
 from accelerate.tracking import LOGGER_TYPE_TO_CLASS, GeneralTracker, get_available_trackers
 
-from unirender.command_line.notices import notice
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.notices import notice
 from unirender.training.config import TrainConfig
 from unirender.training.logs.live import Report
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import torch
 
-from unirender.command_line.writing import writing
 from unirender.errors import UnirenderError
 from unirender.models.config import GONE as GONE_FROM_NETWORKS
 from unirender.system.whole_files import whole_file
+from unirender.system.writing import writing
 from unirender.training.config import TrainConfig
 from unirender.training.loop.card import OF_A_RUN
 

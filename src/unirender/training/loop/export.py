@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from unirender.command_line.writing import writing
 from unirender.errors import UnirenderError
 from unirender.models.build import build_model
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
+from unirender.system.writing import writing
 from unirender.training.data.device_data import DeviceSource
 from unirender.training.data.source import BatchSource, ShardSource
 from unirender.training.loop.card import CARD_FILE, card_text

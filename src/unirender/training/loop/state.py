@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from unirender.command_line.writing import writing
 from unirender.errors import UnirenderError
 from unirender.system.whole_files import whole_file
+from unirender.system.writing import writing
 from unirender.training.data.source import BatchSource
 from unirender.training.logs.live import Report
 from unirender.training.loop.beginning import check_beginning

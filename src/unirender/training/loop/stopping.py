@@ -13,8 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from types import FrameType
 
-from unirender.command_line.parse import Ended
-from unirender.command_line.process_ends import HANG_UP, PASSED_ON_S, SIGNALS
+from unirender.system.ends import HANG_UP, PASSED_ON_S, SIGNALS, Ended
 
 
 @dataclass

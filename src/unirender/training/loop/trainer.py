@@ -20,11 +20,11 @@ import torch
 from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from torch import nn
 
-from unirender.command_line.parse import Ended
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
 from unirender.models.build import build_model
 from unirender.models.priors import Maps
+from unirender.system.ends import Ended
 from unirender.training.config import OptimizerConfig, RunConfig, TrainConfig
 from unirender.training.config_check import check_config
 from unirender.training.data.source import BatchSource, NamesGroups

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from unirender.command_line.notices import notice
 from unirender.command_line.option_checks import check_seed
-from unirender.command_line.parse import Ended
-from unirender.command_line.writing import check_out, writing
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.ends import Ended
+from unirender.system.notices import notice
+from unirender.system.writing import check_out, writing
 from unirender.training.command import Alone
 
 if TYPE_CHECKING:

@@ -11,7 +11,6 @@ from typing import Any
 
 from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 
-from unirender.command_line.notices import notice
 from unirender.errors import UnirenderError
 from unirender.models.build import restart_from_prior
 from unirender.models.config import ModelConfig
@@ -19,6 +18,7 @@ from unirender.models.dual_stream import DualStreamModel
 from unirender.models.split_streams import SplitDualStreamModel
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder
+from unirender.system.notices import notice
 from unirender.training.loop.beginning import Beginning, beginning
 from unirender.training.loop.export import read_history
 from unirender.training.loop.trainer import Trainer

@@ -5,8 +5,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from unirender.command_line.parse import causes
 from unirender.errors import UnirenderError
+from unirender.system.ends import causes
 
 AGAIN = "mend that and run the same command again"
 
