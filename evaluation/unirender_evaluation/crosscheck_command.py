@@ -36,6 +36,7 @@ class BenchCrosscheck:
         from unirender_evaluation import lpips
         from unirender_evaluation.crosscheck import agreements, random_pairs, real_pairs
         from unirender_evaluation.suites.suite import load_suite
+        from unirender_evaluation.tables.text import print_whole
 
         pairs = [*random_pairs(self.pairs, self.seed), *real_pairs(load_suite(self.suite), self.scenes)]
         table = Table(title="Largest difference", title_justify="left")
@@ -48,7 +49,7 @@ class BenchCrosscheck:
             values = (str(item.pairs), f"{item.largest:.2g}", f"{item.tolerance:g}", "" if item.holds else "EXCEEDED")
             table.add_row(item.metric, item.against, *values)
         console = Console()
-        console.print(table)
+        print_whole(console, table)
         for backbone in lpips.BACKBONES:
             if backbone not in lpips.available():
                 console.print(f"LPIPS-{backbone}: no weights on this machine, not compared", highlight=False)

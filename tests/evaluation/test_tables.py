@@ -527,6 +527,20 @@ def test_a_narrow_terminal_cuts_no_number_short(width: int) -> None:
     assert nothing.findall(" InPix2Pix*      -         - ")
 
 
+def test_a_terminal_that_is_too_narrow_for_any_table_gets_every_number() -> None:
+    narrow, wide = (re.findall(r"\d+\.\d+", printed(table(), width)) for width in (20, 200))
+    assert set(narrow) == set(wide)
+    assert "…" not in printed(table(), 20)
+
+
+@pytest.mark.parametrize("width", [10, 80])
+def test_a_table_of_texts_has_every_number_in_one_piece(width: int) -> None:
+    buffer, cells = StringIO(), [f"{10 * i + 0.123456}" for i in range(8)]
+    texts = TextTable("Times", ("what", *"abcdefgh"), ((("a row", *cells),),))
+    texts.show(Console(file=buffer, width=width))
+    assert set(cells) <= set(buffer.getvalue().split())
+
+
 def test_a_column_that_nobody_was_asked_for_is_left_out() -> None:
     relit = [
         Record("relighting", "from-image-hdri", "ours", f"s{i}", f"o{i}", {"relit.psnr@masked-srgb-raw": 20.0 + i})

@@ -188,6 +188,7 @@ class BenchCompare:
         from unirender_evaluation.results.file import read_results
         from unirender_evaluation.results.format import comparison_table
         from unirender_evaluation.results.merge import differences, obstacles
+        from unirender_evaluation.tables.text import print_whole
 
         variant = parsed(self.variant)
         a = read_results(self.a)
@@ -202,7 +203,7 @@ class BenchCompare:
         compared = 0
         for pair in pairs:
             for comparison in compare_pair(a, b, *pair, variant):
-                console.print(comparison_table(comparison))
+                print_whole(console, comparison_table(comparison))
                 compared += 1
         if not compared:
             raise UnirenderError(

@@ -20,6 +20,7 @@ from unirender_evaluation.runs.benchmark import check_request, prepare, views_jo
 from unirender_evaluation.runs.config import BenchConfig, anywhere
 from unirender_evaluation.runs.truth_check import stored_check
 from unirender_evaluation.store import Store
+from unirender_evaluation.tables.text import print_whole
 from unirender_evaluation.truth.check import scenes_here
 
 
@@ -104,7 +105,7 @@ def print_plan(plan: Plan, console: Console) -> None:
     table.add_section()
     stored, missing = (sum(getattr(row, name) for row in plan.rows) for name in ("stored", "missing"))
     table.add_row("all", str(stored), str(missing), "", "")
-    console.print(table)
+    print_whole(console, table)
     scenes = "1 scene" if plan.check_scenes == 1 else f"{plan.check_scenes} scenes"
     check = f"Mitsuba renders {scenes}" if plan.check_date is None else f"that of {plan.check_date} is reused"
     if plan.check_date is None and plan.unchecked:

@@ -22,7 +22,7 @@ from unirender_evaluation.tables.build import Cell, Row, Table
 from unirender_evaluation.tables.counts import cell_counts, label_n
 from unirender_evaluation.tables.protocol import protocol_text
 from unirender_evaluation.tables.specs import Column
-from unirender_evaluation.tables.text import markdown_row, plain_markdown, plain_paragraph
+from unirender_evaluation.tables.text import WIDEST, markdown_row, plain_markdown, plain_paragraph, print_whole
 
 LARGE = 1e6
 MISSING, NOT_AVAILABLE = "-", "n/a"
@@ -113,8 +113,8 @@ def json_text(content: Any) -> str:
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Prints a table to a terminal, split by column groups where it is too narrow; a part has the rows that say
-    something in it.
+    """Prints a table to a terminal or a file, split by column groups where that is too narrow; a part has the rows that
+    say something in it, and is wider where it has to be.
     """
     if table.watermark:
         console.print(f"[bold red]{escape(table.watermark)}[/]")
@@ -125,7 +125,7 @@ def print_table(console: Console, table: Table) -> None:
     for number, indices in enumerate(blocks):
         rich_table = _rich_table(table, indices, console.width)
         rich_table.title = escape(table.heading) if number == 0 else None
-        console.print(rich_table)
+        print_whole(console, rich_table)
     console.print(f"[dim]{escape(protocol_text(table.protocol))}[/]", highlight=False)
     for note in table.notes:
         console.print(f"[dim]{escape(note)}[/]", highlight=False)
@@ -178,7 +178,7 @@ def _fitting(console: Console, table: Table, indices: Sequence[int]) -> list[lis
 
 
 def _rich_width(console: Console, rich_table: RichTable) -> int:
-    return console.measure(rich_table, options=console.options.update(max_width=10_000)).maximum
+    return console.measure(rich_table, options=console.options.update(max_width=WIDEST)).maximum
 
 
 def _rich_rank(text: str, rank: int | None) -> str:

@@ -17,6 +17,7 @@ OWN_MARKUP = re.compile(r"(?<!`)`[^`<>\\]+`(?!`)|\*\*[-+\d.,±∞% ]+\*\*")
 # What begins or ends markup where it stands: HTML, entities, emphasis, code, mathematics, links.
 MARKUP = re.compile(r"[`\\]|<(?=[A-Za-z/!?])|&(?=#?\w+;)|[*~$](?=\S)|(?<![^\W_])_(?=\S)|\](?=[(\[])")
 NUMBERS = re.compile(r"± (?=[\d.∞])|\(n = \d+\)|\[[-+\d.∞]+, [-+\d.∞]+\]")  # what stays on one line of a cell
+WIDEST = 10_000  # of a table, characters
 BLOCK = re.compile(r"^(\d*)([-+*#>.)\[])")  # what makes a line a list, a heading, a quotation, a link's definition
 
 
@@ -58,6 +59,19 @@ def markdown_row(texts: Iterable[str]) -> str:
     return "| " + " | ".join(NUMBERS.sub(together, text.replace("|", r"\|")) for text in texts) + " |"
 
 
+def print_whole(console: Console, table: RichTable) -> None:
+    """Prints a table in which no word is cut short: beyond the console's width, where that is too narrow for them."""
+    wide = console.options.update(max_width=WIDEST)
+    for column in table.columns:
+        texts = [console.measure(text, options=wide) for text in (column.header, *column.cells)]
+        least = max(text.maximum if column.no_wrap else text.minimum for text in texts)
+        column.min_width = max(least, column.min_width or 0)
+    least = console.measure(table, options=wide).minimum
+    if least > console.width:
+        table.width = least
+    console.print(table, crop=False)
+
+
 @dataclass(frozen=True)
 class TextTable:
     """A finished table.
@@ -89,14 +103,14 @@ class TextTable:
         return "\n".join(lines) + "\n"
 
     def show(self, console: Console) -> None:
-        """Prints it to a terminal; where that is narrow, what does not fit goes on below."""
+        """Prints it to a terminal or a file."""
         table = RichTable(title=escape(self.title), box=box.SIMPLE_HEAD, title_justify="left", pad_edge=False)
         for index, name in enumerate(self.columns):
-            table.add_column(escape(name), justify="right" if index else "left", overflow="fold")
+            table.add_column(escape(name), justify="right" if index else "left")
         for section in self.sections:
             for row in section:
                 table.add_row(*map(escape, row))
             table.add_section()
-        console.print(table)
+        print_whole(console, table)
         for note in self.notes:
             console.print(note, style="dim", highlight=False, markup=False)
