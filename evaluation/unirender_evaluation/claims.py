@@ -27,7 +27,12 @@ class MaskedNumber:
     @property
     def key(self) -> str:
         """Under which records hold it."""
-        return metric_key(self.quantity, self.kind, replace(MASKED, scale=self.scale))
+        return metric_key(self.quantity, self.kind, self.variant)
+
+    @property
+    def variant(self) -> Variant:
+        """How it is taken."""
+        return replace(MASKED, scale=self.scale)
 
 
 @dataclass(frozen=True)

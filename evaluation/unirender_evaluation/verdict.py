@@ -5,10 +5,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from unirender_evaluation.claims import CEILING, OUR_CLAIMS, Claim, run_claims
+from unirender_evaluation.ceiling import ceiling_lines
+from unirender_evaluation.claims import OUR_CLAIMS, Claim, run_claims
 from unirender_evaluation.comparisons import Comparison, Lights, Selection, compare, difference_over_lights, values_of
 from unirender_evaluation.records import Record, RunInfo
-from unirender_evaluation.statistics import FEWEST, Estimate, holm, light_count, paired_difference, paired_p_value
+from unirender_evaluation.statistics import Estimate, holm, light_count, paired_p_value
 from unirender_evaluation.task import LIGHT
 
 FEW = 20  # objects or lights: a claim that is not shown of fewer is open, of as many it fails
@@ -18,14 +19,16 @@ FEW = 20  # objects or lights: a claim that is not shown of fewer is open, of as
 class Finding:
     """A claim with its comparison: None where a row has no such value. `holds` is None for a distance that is only
     stated, and where nothing was compared, for the reason `why`. `asked`: on how many samples any row
-    has this number, since a row may answer the easy ones alone. `over_lights`: the difference again, with its interval
-    over objects and lights; None where the lights of the samples, of which there are `lights`, are not known."""
+    has this number, since a row may answer the easy ones alone. `p_value`: of the difference, for Holm's correction.
+    `over_lights`: the difference again, with its interval over objects and lights; None where the lights of the
+    samples, of which there are `lights`, are not known."""
 
     claim: Claim
     comparison: Comparison | None
     holds: bool | None
     why: str = "not run "
     asked: int = 0
+    p_value: float = 1.0
     over_lights: Estimate | None = None
     lights: int = 0
 
@@ -115,7 +118,8 @@ def findings(
             comparison = compare(chosen, claim.kind, key, claim.a, claim.b)
             claimed = claim.expected == "beats"
             asked = len({record.sample for record in whole if key in record.values})
-            finding = Finding(claim, comparison, comparison.a_beats_b if claimed else None, asked=asked)
+            p = paired_p_value(a, b, {record.sample: record.object for record in chosen})
+            finding = Finding(claim, comparison, comparison.a_beats_b if claimed else None, asked=asked, p_value=p)
             if lights:
                 other = difference_over_lights(chosen, key, claim.a, claim.b, lights)
                 finding = replace(finding, over_lights=other, lights=light_count([lights[s] for s in common]))
@@ -131,59 +135,6 @@ def _comparable(whole: list[Record], first: str, key: str) -> list[Record]:
     difference in dB, and without them that row has less to show."""
     exact = {sample for sample, value in values_of(whole, first, key).items() if math.isinf(value)}
     return [record for record in whole if record.sample not in exact] if exact else whole
-
-
-@dataclass(frozen=True)
-class CeilingBreach:
-    """A measured row above the noise ceiling by more than its interval: the truth or the scorer is wrong."""
-
-    table: str
-    protocol: str
-    key: str
-    method: str
-    low_db: float
-
-    def __str__(self) -> str:
-        where = f"{self.table}/{self.protocol} {self.key}"
-        if math.isinf(self.low_db):
-            return f"{self.method} returns the noisy truth itself on {where}: infinite PSNR against a finite ceiling"
-        return f"{self.method} exceeds the noise ceiling on {where} by at least {self.low_db:.2f} dB"
-
-
-def ceiling_breaches(records: Sequence[Record]) -> list[CeilingBreach]:
-    """Rows whose paired PSNR interval against the noise ceiling lies above 0; empty in a sound benchmark.
-
-    (The ceilings of SSIM and LPIPS are scores of a picture with a little noise of its own: a good row may pass them.)
-
-    An infinite score against a finite ceiling has no interval and is a breach by itself. Samples whose truth has no
-    noise have an infinite ceiling, which nothing breaches.
-    """
-    breaches = []
-    for table, protocol in dict.fromkeys((r.table, r.protocol) for r in records if r.method == CEILING):
-        chosen = Selection(table, protocol).of(records)
-        clusters = {r.sample: r.object for r in chosen}
-        bound = [r for r in chosen if r.method == CEILING]
-        for key in sorted({key for r in bound for key in r.values if ".psnr" in key}):
-            limit = {r.sample: r.values[key] for r in bound if math.isfinite(r.values.get(key, math.inf))}
-            for method in sorted({r.method for r in chosen} - {CEILING}):
-                rows = (r for r in chosen if r.method == method and key in r.values and r.sample in limit)
-                values = {r.sample: r.values[key] for r in rows}
-                if not values:
-                    continue  # no sample in common: the row was not asked, or no truth here has noise
-                infinite = math.inf in values.values()
-                low = math.inf if infinite else paired_difference(values, limit, clusters).low
-                if low > 0:
-                    breaches.append(CeilingBreach(table, protocol, key, method, low))
-    return breaches
-
-
-def _no_breach(records: Sequence[Record]) -> str:
-    bound = [record for record in records if record.method == CEILING]
-    if bound and len({record.object for record in bound}) < FEWEST:
-        return f"  open   noise ceiling: nothing is told of fewer than {FEWEST} objects"
-    if bound:
-        return "  HOLDS  no measured row exceeds the noise ceiling by more than its interval"
-    return "  open   noise ceiling: these results have no row of it, which a row could exceed"
 
 
 UNNAMED = "what holds under other lights is not told: the lights of the samples are not named"
@@ -205,9 +156,8 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, li
     lines = [f"Verdict on suite {run.suite} ({HEAD})"]
     found = judged(records, run, lights)
     lines += [f"  {finding}" for finding in found]
-    lines += [f"  ({line})" for line in summary(records, found)]
-    breaches = ceiling_breaches(records)
-    lines += [f"  FAILS  {breach}" for breach in breaches] or [_no_breach(records)]
+    lines += [f"  ({line})" for line in summary(found)]
+    lines += ceiling_lines(records)
     told = "what its check found stands in the run's verdict.txt"
     unknown = f"not rendered again ({run.unchecked})" if run.unchecked else told
     lines += _truth_lines(check) if check else [f"  open   truth: {unknown}"]
@@ -230,18 +180,18 @@ def _by_keys(finding: Finding) -> str:
 Named = Callable[[Finding], str]
 
 
-def summary(records: Sequence[Record], found: Sequence[Finding], named: Named = _by_keys) -> list[str]:
+def summary(found: Sequence[Finding], named: Named = _by_keys) -> list[str]:
     """How many of the claims that hold are certain together, and how many hold under other lights; `named`: how the
     others are called."""
     if not any(f.comparison for f in found):
         return []
-    return [*_corrected_lines(records, found, named), *_other_lights_lines(found, named)]
+    return [*_corrected_lines(found, named), *_other_lights_lines(found, named)]
 
 
-def _corrected_lines(records: Sequence[Record], found: Sequence[Finding], named: Named) -> list[str]:
+def _corrected_lines(found: Sequence[Finding], named: Named) -> list[str]:
     """How many of the claims that hold would do so if all claims were one question; nothing where none holds."""
     claimed = [f for f in found if f.holds is not None and f.comparison is not None and f.comparison.decided]
-    sure = holm([_p_value(records, finding.claim) for finding in claimed])
+    sure = holm([finding.p_value for finding in claimed])
     holding = [(f, certain) for f, certain in zip(claimed, sure, strict=True) if f.holds]
     if not holding:
         return []
@@ -269,13 +219,6 @@ def _other_lights_lines(found: Sequence[Finding], named: Named) -> list[str]:
     wider = sorted(ratio for finding in holding if math.isfinite(ratio := finding.times_as_wide))
     grown = f"; their intervals are {wider[0]:.2f} to {wider[-1]:.2f} times as wide" if wider else ""
     return [f"of {len(holding)} claims that hold {also} also do under other lights{but}{grown}"]
-
-
-def _p_value(records: Sequence[Record], claim: Claim) -> float:
-    key, whole = claim.key, Selection(claim.table, claim.protocol).of(records)
-    chosen = _comparable(whole, claim.a, key)
-    a, b = (values_of(chosen, method, key) for method in (claim.a, claim.b))
-    return paired_p_value(a, b, {record.sample: record.object for record in chosen})
 
 
 def _truth_lines(check: dict) -> list[str]:

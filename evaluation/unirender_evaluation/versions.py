@@ -84,7 +84,7 @@ COMMANDS = (
     "truth/sources",
     "validation",
 )
-FROM_RECORDS = ("claims", "comparisons", "statistics", "table_list", "verdict")
+FROM_RECORDS = ("ceiling", "claims", "comparisons", "statistics", "table_list", "verdict")
 # Of the shared vocabulary's folder: the docstrings of its packages, the command line, names of checkpoints, processes,
 # and what is said of errors.
 OUTSIDE = (

@@ -17,6 +17,7 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation import engine
+from unirender_evaluation.ceiling import ceiling_breaches
 from unirender_evaluation.claims import OURS
 from unirender_evaluation.metrics import ALL_VARIANTS
 from unirender_evaluation.predictions.check import PredictionError
@@ -29,7 +30,6 @@ from unirender_evaluation.runs.config import BenchConfig, anywhere, build_rows, 
 from unirender_evaluation.suites.suite import Suite, load_suite
 from unirender_evaluation.tasks import scene_ids, tasks
 from unirender_evaluation.truth.check import chosen_scenes
-from unirender_evaluation.verdict import ceiling_breaches
 
 
 @pytest.fixture(scope="module")

@@ -24,6 +24,7 @@ from unirender.errors import UnirenderError
 from unirender.exr import image_channels, intrinsics_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
+from unirender_evaluation.ceiling import ceiling_breaches
 from unirender_evaluation.engine import Prediction, method_jobs, score
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.methods.composite import Composite
@@ -42,7 +43,6 @@ from unirender_evaluation.suites.suite import Scene, Suite
 from unirender_evaluation.tables.protocol import doubts, mask_source
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import tasks
-from unirender_evaluation.verdict import ceiling_breaches
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
 
 NO_MITSUBA = Subsets(mitsuba=0)

@@ -22,7 +22,8 @@ from unirender_evaluation.methods.mitsuba import mitsuba_jobs
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.predictions.check import PredictionError, check_predictions
 from unirender_evaluation.predictions.folder import PredictionFolder
-from unirender_evaluation.records import Record, RunInfo
+from unirender_evaluation.records import MethodInfo, Record, RunInfo
+from unirender_evaluation.results.verdict import claims_table
 from unirender_evaluation.rows import make_row, prediction_rows, trivial_rows
 from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.table_list import ALL_TABLES
@@ -298,6 +299,10 @@ def test_the_verdict_says_which_numbers_of_a_light_are_aligned() -> None:
     raw = next(line for line in lines if "ball_matte error (raw)" in line and "mean-light" in line)
     assert aligned.startswith("HOLDS")
     assert raw.startswith("stated")
+    methods = (MethodInfo("ours-mean", "Ours (mean)", "ours"), MethodInfo("mean-light", "mean light", "trivial"))
+    (claims,) = claims_table(RunInfo("t", "h", 64, methods), records, {}).sections
+    numbers = [name.partition(": ")[2] for name, *_ in claims]
+    assert numbers == ["Matte ball (aligned) error", "Matte ball error"], "as the columns of the table are called"
     assert "-0.3 " in raw
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from unirender_evaluation.ceiling import ceiling_breaches
 from unirender_evaluation.claims import (
     OPTIMISED,
     OUR_CLAIMS,
@@ -19,7 +20,7 @@ from unirender_evaluation.claims import (
     stranger_claims,
 )
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
-from unirender_evaluation.verdict import Finding, ceiling_breaches, findings, summary, verdict_text
+from unirender_evaluation.verdict import Finding, findings, summary, verdict_text
 
 CHECK = {
     "passed": True,
@@ -285,7 +286,7 @@ def test_identical_pictures_do_not_end_the_run() -> None:
     def found(a: Sequence[float], b: Sequence[float]) -> Finding:
         records = [r for method, values in (("a", a), ("b", b)) for r in rows(method, ALBEDO, np.array(values))]
         judged = findings(records, [claim])
-        assert len(summary(records, judged)) == 2 * (judged[0].holds is True), "by the same samples"
+        assert len(summary(judged)) == 2 * (judged[0].holds is True), "by the same samples"
         return judged[0]
 
     levels = [20.0, 21.0, 22.5, 20.0, 21.5, 22.0]
@@ -331,7 +332,12 @@ def test_a_row_breaches_the_ceiling_where_its_interval_over_objects_does() -> No
     assert f"  FAILS  exact returns the noisy truth itself {where}: infinite PSNR" in text
     assert "HOLDS  no measured row" not in text
     below = [record for record in records if record.method in ("noise-ceiling", "below")]
-    assert "  HOLDS  no measured row exceeds the noise ceiling" in verdict_text(below, run_of(), CHECK)
+    few = [replace(record, table="rendering", protocol="given", object=f"o{i % 2}") for i, record in enumerate(below)]
+    told = "  HOLDS  no measured row exceeds the noise ceiling by more than its interval (inverse/single-image)\n"
+    untold = "  open   noise ceiling: nothing is told of fewer than 3 objects (rendering/given)\n"
+    assert f"{told}{untold}" in verdict_text([*below, *few], run_of(), CHECK)
+    assert told in verdict_text(below, run_of(), CHECK)
+    assert "HOLDS  no measured row" not in verdict_text(few, run_of(), CHECK)
     assert "  open   noise ceiling: these results have no row of it" in verdict_text(below[-1:], run_of(), CHECK)
 
 

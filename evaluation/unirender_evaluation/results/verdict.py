@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from unirender_evaluation.ceiling import ceiling_breaches
 from unirender_evaluation.comparisons import Lights
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.table_list import ALL_TABLES
@@ -10,7 +11,7 @@ from unirender_evaluation.tables.formats import MISSING, json_number, json_text
 from unirender_evaluation.tables.latex import tex_needs, tex_row, tex_text
 from unirender_evaluation.tables.specs import PROTOCOLS
 from unirender_evaluation.tables.text import TextTable
-from unirender_evaluation.verdict import HEAD, Finding, ceiling_breaches, judged, scale_said, summary, verdict_text
+from unirender_evaluation.verdict import HEAD, Finding, judged, scale_said, summary, verdict_text
 
 COLUMNS = ("number", "A", "B", "A - B", "over objects", "under other lights", "n (objects, lights)")
 
@@ -27,7 +28,7 @@ def _json(run: RunInfo, records: Sequence[Record], lights: Lights) -> str:
         "limit": run.limit,
         "how": HEAD,
         "claims": [_plain(finding) for finding in found],
-        "summary": summary(records, found),
+        "summary": summary(found),
         "ceiling_breaches": list(map(str, ceiling_breaches(records))),
     }
     return json_text(content)
@@ -54,7 +55,7 @@ def claims_table(run: RunInfo, records: Sequence[Record], lights: Lights, stated
     found = judged(records, run, lights)
     shown = [finding for finding in found if finding.comparison is not None and (stated or finding.holds is not None)]
     rows = tuple(_cells(run, finding) for finding in shown)
-    summed = summary(records, found, lambda finding: "{}: {} against {}".format(*_names(run, finding)))
+    summed = summary(found, lambda finding: "{}: {} against {}".format(*_names(run, finding)))
     limit = () if run.limit is None else (f"--limit {run.limit}: a partial run, not a result",)
     notes = (f"{HEAD}.", *(f"{line[0].upper()}{line[1:]}." for line in summed), *limit)
     return TextTable(f"Verdict on suite {run.suite}", COLUMNS, (rows,), notes)
@@ -63,12 +64,12 @@ def claims_table(run: RunInfo, records: Sequence[Record], lights: Lights, stated
 def _names(run: RunInfo, finding: Finding) -> tuple[str, str, str]:
     """A claim's number and its rows, as tables call them."""
     claim, spec = finding.claim, ALL_TABLES[finding.claim.table]
-    asked = claim.quantity, claim.metric
-    group = next(column.group for column in spec.columns if (column.quantity, column.metric.name) == asked)
+    column = next(column for column in spec.columns if column.key(claim.variant) == claim.key)
+    scale = "" if "scale" in column.overrides else scale_said(claim)  # which its group says
     title = f"{spec.title}, {PROTOCOLS[claim.protocol].label}"
     labels = {info.key: info.label for info in run.methods}
     a, b = (labels.get(key, key) for key in (claim.a, claim.b))  # a row that did not run has no label
-    return f"{title}: {group} {claim.kind.label}{scale_said(claim)}", a, b
+    return f"{title}: {column.group} {claim.kind.label}{scale}", a, b
 
 
 def _cells(run: RunInfo, finding: Finding) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from multiview_pieces import SMALL
 
+from unirender_evaluation.ceiling import ceiling_breaches
 from unirender_evaluation.multiview.methods import ConstantObject
 from unirender_evaluation.multiview.pictures import MultiviewPictures
 from unirender_evaluation.multiview.rows import TRIVIAL_USES, multiview_jobs
@@ -24,7 +25,6 @@ from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables.build import Table, build_tables
 from unirender_evaluation.tables.formats import to_json, to_markdown
 from unirender_evaluation.tables.latex import to_latex
-from unirender_evaluation.verdict import ceiling_breaches
 from unirender_evaluation.versions import LPIPS, MULTIVIEW, OPTIMIZER, REFERENCE, Versions
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.views import Views
