@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.results.coverage import bootstrap, coverage_of_draws, of_few_lights
+from unirender_evaluation.results.coverage import bootstrap, coverage_of_draws, least_by_chance, of_few_lights
 from unirender_evaluation.results.coverage import coverage as coverage_of
 from unirender_evaluation.statistics import (
     FEWEST,
@@ -121,6 +121,12 @@ def test_a_bootstrap_of_few_objects_holds_the_mean_less_often() -> None:
     sums, sizes = np.array([own.sum() for own in objects]), np.array([len(own) for own in objects])
     of_all = mean_estimate(np.concatenate(objects), np.repeat(np.arange(100), sizes).tolist())
     assert bootstrap(sums, sizes) == pytest.approx((of_all.low, of_all.high), rel=0.003)
+
+
+def test_the_least_of_many_shares_is_below_what_each_says() -> None:
+    drawn = np.random.default_rng(0).binomial(200, 0.95, size=(20_000, 43)).min(axis=1) / 200
+    assert least_by_chance(43, 200) == pytest.approx(np.quantile(drawn, [0.025, 0.975]))
+    assert least_by_chance(1, 200)[1] > 0.95 > least_by_chance(43, 200)[1]
 
 
 def test_of_many_objects_it_is_as_wide_as_their_spread_says() -> None:

@@ -157,7 +157,25 @@ def draws_table(results: Results, counts: Sequence[int] = COUNTS, draws: int = D
     means = [f"{student:.1f} / {resampled:.1f}" for student, resampled in held.mean(axis=0)]
     least = [f"{student:.1f}" for student in held[:, :, 0].min(axis=0)]
     lines = [[f"mean of {len(found)} differences", *means], ["the least of them, Student's t", *least]]
-    return markdown_table([f"objects of {results.run.suite}", *map(str, counts)], lines)
+    low, high = least_by_chance(len(found), draws)
+    return (
+        f"{markdown_table([f'objects of {results.run.suite}', *map(str, counts)], lines)}\n"
+        f"Of {len(found)} that hold as often as they say the least would be {100 * low:.1f} to {100 * high:.1f}."
+    )
+
+
+def least_by_chance(numbers: int, draws: int = DRAWS) -> tuple[float, float]:
+    """Between which shares the least of so many lies in 95 of 100 cases, if all intervals hold as often as they say.
+
+    Args:
+        numbers: whose intervals are counted, each by draws of its own.
+        draws: of each.
+    """
+    from scipy.special import bdtr
+
+    at_most = 1 - (1 - bdtr(np.arange(draws + 1), draws, CONFIDENCE)) ** numbers  # the least has k that hold, or fewer
+    low, high = np.searchsorted(at_most, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2]) / draws
+    return float(low), float(high)
 
 
 def structures(suite: Suite) -> dict[str, Samples]:
