@@ -1,6 +1,10 @@
 """The page *What the tables say*: what it asks, and its tables of results that have the answers or lack them."""
 
+import ast
+import inspect
+
 import pytest
+from doc_blocks import DOCS, blocks
 from small_results import small_results
 
 from unirender.errors import UnirenderError
@@ -10,6 +14,7 @@ from unirender_evaluation.results.page import Page
 from unirender_evaluation.results.questions import BY_TARGET, SECTIONS, VIEWS, Section
 from unirender_evaluation.suites.suite import load_suite
 
+CELL, TAGS = "{code-cell} python", ":tags: [remove-input]\n"
 ALBEDO = Question("albedo", "inverse", "single-image", "albedo", "psnr", "ours-mean", "input-as-albedo")
 
 
@@ -17,6 +22,27 @@ ALBEDO = Question("albedo", "inverse", "single-image", "albedo", "psnr", "ours-m
 def page() -> Page:
     one = small_results()
     return Page(one, one, one, load_suite("tiny"))
+
+
+def calls() -> list[tuple[str, list[str]]]:
+    """What the last line of each cell of the page calls, and with what."""
+    cells = [block.text.removeprefix(TAGS) for block in blocks(DOCS / "findings.md") if block.language == CELL]
+    last = [ast.parse(cell.splitlines()[-1], mode="eval").body for cell in cells]
+    found = [line for line in last if isinstance(line, ast.Call)]
+    assert len(found) == len(cells) > 0
+    return [(ast.unparse(line.func), [ast.literal_eval(word) for word in line.args]) for line in found]
+
+
+def test_the_page_calls_what_there_is() -> None:
+    """The build of the documentation runs its cells, which takes a minute."""
+    for called, words in calls():
+        name = called.removeprefix("page.")
+        inspect.signature(getattr(Page, name)).bind(None, *words)
+
+
+def test_the_page_shows_every_section_once() -> None:
+    """All of their lines count in the correction."""
+    assert sorted(words[0] for called, words in calls() if called == "page.table") == sorted(SECTIONS)
 
 
 def test_no_question_is_asked_twice() -> None:
