@@ -19,6 +19,7 @@ from unirender.errors import UnirenderError, UsageError
 from unirender.exr import image_channels, intrinsics_channels, on_pole_grid, read_exr, write_environment, write_exr
 from unirender.files import new_folder, read_result, write_result
 from unirender.intrinsics import Intrinsics
+from unirender.pictures import read_picture
 from unirender.shipped import checkpoint_sha256
 from unirender.system.whole_files import replace_file, whole_file
 
@@ -324,6 +325,22 @@ def test_a_file_is_replaced_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         replace_file(path, "newer")
     assert path.read_bytes() == b"new"
     assert [file.name for file in path.parent.iterdir()] == ["file"]
+
+
+def test_what_is_no_plain_file_is_not_read(tmp_path: Path) -> None:
+    """A pipe that nobody writes to was waited for."""
+    pipe, loop = tmp_path / "pipe.exr", tmp_path / "loop.exr"
+    os.mkfifo(pipe)
+    loop.symlink_to(loop)
+    for path in (pipe, Path(os.devnull)):
+        with pytest.raises(UnirenderError, match=f"{path}: is a pipe or a device, expected an OpenEXR file"):
+            read_exr(path)
+        with pytest.raises(UnirenderError, match=f"{path}: is a pipe or a device, expected a picture"):
+            read_picture(path)
+    with pytest.raises(UnirenderError, match=r"loop.exr: cannot be read \(Too many levels of symbolic links\)"):
+        read_exr(loop)
+    with pytest.raises(UnirenderError, match=r"loop.exr: no such file, expected a picture"):
+        read_picture(loop)
 
 
 def test_what_is_no_plain_file_is_not_replaced_by_one(tmp_path: Path) -> None:

@@ -83,6 +83,13 @@ def test_rows_change_what_their_group_says() -> None:
             assert "transport.enabled" in changed, row.name
 
 
+def test_small_rates_are_a_quarter_of_every_rate() -> None:
+    rows = {row.name: dataclasses.asdict(row.config.refine) for row in ingredients()}
+    rates = [name for name in rows[FULL] if name.endswith("_rate")]
+    assert rates
+    assert all(rows["small-rates"][name] == rows[FULL][name] / 4 for name in rates)
+
+
 def test_the_plain_row_is_the_plain_loop_of_the_multi_view_table() -> None:
     plain = next(row for row in ingredients() if row.name == "plain")
     assert plain.config.refine == PlainLoop().settings
