@@ -165,17 +165,6 @@ def test_every_prior_reaches_its_map(views: Views, truth: Solution, field: str) 
     assert not fit.priors(state)
 
 
-@pytest.mark.long
-def test_the_demodulated_loss_is_of_light_alone(views: Views, truth: Solution) -> None:
-    plain, with_light = (Fit(views, truth, dataclasses.replace(FAST, demodulated=w)) for w in (0.0, 1.0))
-    state = RefineState.begin(truth, FAST)
-    (values, one), (more, other) = plain.pictures(state), with_light.pictures(state)
-    assert "demodulated" in more
-    assert "demodulated" not in values
-    assert np.abs(other["environment"] - one["environment"]).max() > 1e-4
-    np.testing.assert_allclose(other["albedo"], one["albedo"], atol=1e-6)
-
-
 def test_pixels_are_weighed_by_what_the_start_explains(
     views: Views, truth: Solution, monkeypatch: pytest.MonkeyPatch
 ) -> None:

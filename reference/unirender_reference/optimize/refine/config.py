@@ -76,8 +76,6 @@ class RefineConfig:
     """Weight of the squared distance of roughness and metallic from the start."""
     albedo_anchor: float = 0.0
     """Weight of the squared distance of the albedo from the start."""
-    demodulated: float = 0.0
-    """Weight of NvDiffRecMC's light regulariser: the light on a white object shall be as bright as the picture."""
     random_background: bool = False
     """Pictures are compared over a colour drawn for each iteration."""
     held_out_every: int = 0
@@ -96,7 +94,7 @@ class RefineConfig:
         rates = {"albedo_rate": 0, "roughness_rate": 0, "metallic_rate": 0, "light_rate": 0}
         weights = (
             *("white_light", "neutral_light", "light_smoothness", "albedo_smoothness", "material_smoothness"),
-            *("light_anchor", "material_anchor", "albedo_anchor", "demodulated"),
+            *("light_anchor", "material_anchor", "albedo_anchor"),
         )
         require_least(self, "refine", counts | levels | rates | dict.fromkeys(weights, 0))
         require_one_of(self, "refine", {"loss": get_args(LossKind), "parametrisation": get_args(Space)})

@@ -136,10 +136,6 @@ class Fit:
         value, image_gradient = self.loss(images[..., :3], background, images[..., 3:])
         found = self.scene.gradients(maps, image_gradient, config.spp_gradient, other)
         values = {"loss": value, "psnr": self.loss.psnr(images[..., :3])}
-        if config.demodulated:
-            value, light = self._demodulated(maps, seed)
-            values["demodulated"] = value
-            found["environment"] = found["environment"] + config.demodulated * light
         gradients = {name: found[name].reshape(state.parameters[name].shape) for name in NAMES}
         return values, {
             name: parameter_gradient(name, state.parameters[name], gradients[name], config.parametrisation)
@@ -189,22 +185,3 @@ class Fit:
         for name, weight in zip(NAMES, anchors, strict=True):
             add(f"{name}_anchor", weight, name, lambda name=name: anchor(now[name], first[name]))
         return found
-
-    def _demodulated(self, maps: Maps, seed: int) -> tuple[float, Float[np.ndarray, "eh ew 3"]]:
-        """NvDiffRecMC's |Y(light) - V(picture)|: the light that a white object reflects, against the picture's value.
-
-        (Hasselgren et al. 2022, eq. 8): Y is the mean over channels of the light, V the largest channel of the picture.
-        """
-        config = self.config
-        white = {**maps, "albedo": np.ones_like(maps["albedo"]), "metallic": np.zeros_like(maps["metallic"])}
-        images = self.scene.image(white, config.spp, derive_seed(seed, "white"))
-        luminance = images[..., :3].mean(axis=-1, keepdims=True)
-        value = self.loss.target.max(axis=-1, keepdims=True)
-        difference = np.log1p(luminance) - np.log1p(value)
-        covered = self.loss.coverage > 0
-        count = float(self.loss.coverage.sum())
-        slope = np.where(covered, np.sign(difference) / (1 + luminance) / 3 / count, 0)
-        gradient = np.repeat(slope, 3, axis=-1).astype(np.float32)
-        own = derive_seed(seed, "white gradient")
-        found = self.scene.gradients(white, gradient, config.spp_gradient, own, ("environment",))
-        return float(np.abs(difference).sum(where=covered)) / count, found["environment"]
