@@ -103,7 +103,6 @@ def ingredients(seed: int = 0) -> tuple[Ingredient, ...]:
         refined("smooth-light", "smooth light", PRIORS, light_smoothness=1.5e-3),
         refined("smooth-albedo", "smooth albedo", PRIORS, albedo_smoothness=0.015),
         refined("smooth-materials", "smooth roughness and metallic", PRIORS, material_smoothness=0.03),
-        refined("random-background", "random background", PRIORS, random_background=True),
         refined("anchors", "maps held at the start", PRIORS, albedo_anchor=0.2, material_anchor=0.2, light_anchor=4e-3),
         grey("from-grey", "the full method's refinement", full.refine),
         grey("plain", f"plain loop, {PLAIN_ITERATIONS} steps", plain),

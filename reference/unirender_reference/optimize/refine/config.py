@@ -76,8 +76,6 @@ class RefineConfig:
     """Weight of the squared distance of roughness and metallic from the start."""
     albedo_anchor: float = 0.0
     """Weight of the squared distance of the albedo from the start."""
-    random_background: bool = False
-    """Pictures are compared over a colour drawn for each iteration."""
     held_out_every: int = 0
     """Iterations between measures of the fit to held-out views; 0: never."""
     seed: int = 0

@@ -55,26 +55,14 @@ class ImageLoss:
         if one_sided:
             self.saturated = np.stack([views.saturated(view) for view in pictures]) & (self.coverage > 0)
 
-    def __call__(
-        self,
-        images: Images,
-        background: Float[np.ndarray, "3"] | None = None,
-        alpha: Float[np.ndarray, "n h w 1"] | None = None,
-    ) -> tuple[float, Images]:
+    def __call__(self, images: Images) -> tuple[float, Images]:
         """Value, and derivative with respect to the images.
 
         Args:
             images: premultiplied linear radiance.
-            background: radiance behind both pictures (NvDiffRec's random background); None: black.
-            alpha: coverage of the images, where a background is given.
         """
-        x, t = images, self.target
-        if background is not None and alpha is not None:
-            x, t = x + (1 - alpha) * background, t + (1 - self.coverage) * background
-        error, slope = pixel_loss(x, t, self.kind)
-        counted = ~(self.saturated & (x > t))
-        if background is None:
-            counted &= self.coverage > 0
+        error, slope = pixel_loss(images, self.target, self.kind)
+        counted = (self.coverage > 0) & ~(self.saturated & (images > self.target))
         value = float((self._share * error).sum(where=counted, dtype=np.float64)) / self._count
         return value, (np.where(counted, self._share * slope, 0) / self._count).astype(np.float32)
 

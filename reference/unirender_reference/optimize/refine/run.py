@@ -132,8 +132,7 @@ class Fit:
         seed = derive_seed(config.seed, "refine", 0 if config.common_random_numbers else state.iteration)
         other = derive_seed(seed, "gradient") if config.decorrelated else seed
         images = self.scene.image(maps, config.spp, seed)
-        background = np.random.default_rng(seed).random(3).astype(np.float32) if config.random_background else None
-        value, image_gradient = self.loss(images[..., :3], background, images[..., 3:])
+        value, image_gradient = self.loss(images[..., :3])
         found = self.scene.gradients(maps, image_gradient, config.spp_gradient, other)
         values = {"loss": value, "psnr": self.loss.psnr(images[..., :3])}
         gradients = {name: found[name].reshape(state.parameters[name].shape) for name in NAMES}
