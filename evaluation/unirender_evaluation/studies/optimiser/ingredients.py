@@ -89,7 +89,6 @@ def ingredients(seed: int = 0) -> tuple[Ingredient, ...]:
         refined("linear-steps", "steps in linear albedo and light", parametrisation="linear"),
         refined("direct-light", "direct light only: no interreflection", depth=2),
         refined("same-samples", "picture and derivative share their samples", decorrelated=False),
-        refined("common-numbers", "every step draws the same samples", common_random_numbers=True),
         refined("constant-rates", "learning rates do not decay", decay=1.0),
         refined(
             "small-rates",

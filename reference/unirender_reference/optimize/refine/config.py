@@ -34,8 +34,6 @@ class RefineConfig:
     """Longest path: 2 is direct light with its shadows, 4 has three bounces."""
     decorrelated: bool = True
     """Picture and derivative draw different samples; off: the same, with a biased gradient."""
-    common_random_numbers: bool = False
-    """Every iteration draws the same samples."""
     parametrisation: Space = "perceptual"
     """Steps in display values of albedo and logarithms of light, or in the linear values themselves."""
     albedo_rate: float = 0.01

@@ -129,7 +129,7 @@ class Fit:
     def pictures(self, state: RefineState) -> tuple[dict[str, float], dict[Name, Float[np.ndarray, "h w c"]]]:
         """The loss of the pictures with the fit in dB, and derivatives with respect to the parameters."""
         config, maps = self.config, state.maps(self.config)
-        seed = derive_seed(config.seed, "refine", 0 if config.common_random_numbers else state.iteration)
+        seed = derive_seed(config.seed, "refine", state.iteration)
         other = derive_seed(seed, "gradient") if config.decorrelated else seed
         images = self.scene.image(maps, config.spp, seed)
         value, image_gradient = self.loss(images[..., :3])
