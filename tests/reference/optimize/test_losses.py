@@ -28,11 +28,7 @@ def views_of(displayed: np.ndarray, mask: np.ndarray | None = None, hdr: bool = 
 def test_derivative_is_that_of_the_value(kind: LossKind) -> None:
     x, t, step = pictures(0), pictures(1), 1e-3
     _, slope = pixel_loss(x, t, kind)
-    if kind == "relative":  # its denominator is held fixed
-        held = 1 / (x.astype(np.float64) + 0.01) ** 2
-        central = held * ((x + step - t) ** 2 - (x - step - t) ** 2) / (2 * step)
-    else:
-        central = (pixel_loss(x + step, t, kind)[0] - pixel_loss(x - step, t, kind)[0]) / (2 * step)
+    central = (pixel_loss(x + step, t, kind)[0] - pixel_loss(x - step, t, kind)[0]) / (2 * step)
     np.testing.assert_allclose(slope, central, rtol=0.01, atol=2e-3)
     assert np.abs(1.1 * slope - central).max() > 0.02  # the tolerance can tell
 

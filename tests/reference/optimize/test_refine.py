@@ -201,7 +201,7 @@ def test_a_light_is_interpolated_as_the_renderer_does(truth: Solution) -> None:
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("loss", "l1", r"--refine\.loss l1: expected one of log, srgb, linear, relative, slope"),
+        ("loss", "l1", r"--refine\.loss l1: expected one of log, srgb, linear, slope"),
         ("parametrisation", "log", r"--refine\.parametrisation log: expected one of perceptual, linear"),
         ("spp", 0, r"--refine\.spp 0: expected 1 or more"),
     ],

@@ -75,7 +75,6 @@ def ingredients(seed: int = 0) -> tuple[Ingredient, ...]:
         refined("log", "NvDiffRec's log-tonemapped loss", loss="log"),
         refined("srgb", "squared error of display values", loss="srgb"),
         refined("linear", "squared error of radiance", loss="linear"),
-        refined("relative", "relative squared error", loss="relative"),
         refined("same-weights", "pixels count the same, however the start explains them", robust=False),
         refined("two-sided", "saturated pixels count as exact", one_sided=False),
         refined(

@@ -8,7 +8,7 @@ from unirender_reference.optimize.option_checks import require_least, require_on
 
 LEAST_LIGHT_ROWS = 4
 
-LossKind = Literal["log", "srgb", "linear", "relative", "slope"]
+LossKind = Literal["log", "srgb", "linear", "slope"]
 Space = Literal["perceptual", "linear"]
 
 
