@@ -42,12 +42,6 @@ def white_light(environment: Float[np.ndarray, "h w 3"]) -> tuple[float, Float[n
     return float(np.abs(difference).mean(dtype=np.float64)), slope.astype(np.float32)
 
 
-def neutral_light(log_light: Float[np.ndarray, "h w 3"]) -> tuple[float, Float[np.ndarray, "h w 3"]]:
-    """Mean square of what the logarithm of a texel's channels differs from their mean; scale-free."""
-    difference = log_light - log_light.mean(axis=-1, keepdims=True)
-    return float((difference**2).mean(dtype=np.float64)), 2 * difference / log_light.size
-
-
 def anchor(values: Map, first: Map) -> tuple[float, Map]:
     """Mean square distance from where the optimisation began, and its derivative."""
     difference = values - first

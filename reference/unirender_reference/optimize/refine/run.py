@@ -12,7 +12,7 @@ from jaxtyping import Float
 from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.refine.losses import ImageLoss
 from unirender_reference.optimize.refine.parameters import NAMES, Name, parameter_gradient, to_map, to_parameter
-from unirender_reference.optimize.refine.priors import anchor, neutral_light, smoothness, white_light
+from unirender_reference.optimize.refine.priors import anchor, smoothness, white_light
 from unirender_reference.optimize.refine.scene import TexturedScene
 from unirender_reference.optimize.refine.state import RefineState
 from unirender_reference.optimize.solution import Solution
@@ -161,16 +161,11 @@ class Fit:
             value, slope = white_light(light)
             return value, of_light(slope)
 
-        def neutral() -> tuple[float, np.ndarray]:
-            value, slope = neutral_light(logs)
-            return value, of_light(slope / light)
-
         def smooth_light() -> tuple[float, np.ndarray]:
             value, slope = smoothness(logs, LIGHT_WIDTH, circular=True)
             return value, of_light(slope / light)
 
         add("white_light", config.white_light, "environment", white)
-        add("neutral_light", config.neutral_light, "environment", neutral)
         add("light_smoothness", config.light_smoothness, "environment", smooth_light)
         add("albedo_smoothness", config.albedo_smoothness, "albedo", lambda: smoothness(now["albedo"], TEXTURE_WIDTH))
         for name in ("roughness", "metallic"):
