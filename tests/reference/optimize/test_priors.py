@@ -11,7 +11,6 @@ Prior = Callable[[np.ndarray], tuple[float, np.ndarray]]
 FIRST = np.random.default_rng(1).uniform(0.1, 1, (4, 6, 3)).astype(np.float32)
 PRIORS: dict[str, Prior] = {
     "smooth": lambda x: smoothness(x, 0.1),
-    "smooth circle": lambda x: smoothness(x, 0.1, circular=True),
     "white": white_light,
     "anchor": lambda x: anchor(x, FIRST),
 }
@@ -49,10 +48,3 @@ def test_edges_cost_less_than_their_square() -> None:
     assert two == pytest.approx(2 * one, rel=0.05)
     small = smoothness(0.001 * step, 0.02)[0]
     assert smoothness(0.002 * step, 0.02)[0] == pytest.approx(4 * small, rel=0.05)
-
-
-def test_a_light_is_a_circle() -> None:
-    ramp = np.tile(np.arange(6, dtype=np.float32)[None, :, None], (4, 1, 3))
-    assert smoothness(ramp, 0.01, circular=True)[0] > 1.5 * smoothness(ramp, 0.01)[0]
-    turned = np.roll(ramp, 2, axis=1)
-    assert smoothness(turned, 0.01, True)[0] == pytest.approx(smoothness(ramp, 0.01, True)[0], rel=1e-5)

@@ -98,7 +98,6 @@ def ingredients(seed: int = 0) -> tuple[Ingredient, ...]:
             light_rate=full.refine.light_rate / 4,
         ),
         refined("white-light", "light drawn to white", PRIORS, white_light=1.5e-3),
-        refined("smooth-light", "smooth light", PRIORS, light_smoothness=1.5e-3),
         refined("smooth-albedo", "smooth albedo", PRIORS, albedo_smoothness=0.015),
         refined("smooth-materials", "smooth roughness and metallic", PRIORS, material_smoothness=0.03),
         refined("anchors", "maps held at the start", PRIORS, albedo_anchor=0.2, material_anchor=0.2, light_anchor=4e-3),

@@ -60,8 +60,6 @@ class RefineConfig:
     """Rows of the light that is refined: the start is interpolated; 0: as many as the start has."""
     white_light: float = 0.0
     """Weight of NvDiffRec's regulariser: mean |E_c - mean E|."""
-    light_smoothness: float = 0.0
-    """Weight of the smoothness of the light's logarithm."""
     albedo_smoothness: float = 0.0
     """Weight of the smoothness of the albedo."""
     material_smoothness: float = 0.0
@@ -87,7 +85,7 @@ class RefineConfig:
         levels = {"albedo_levels": 1, "material_levels": 1, "light_levels": 1}
         rates = {"albedo_rate": 0, "roughness_rate": 0, "metallic_rate": 0, "light_rate": 0}
         weights = (
-            *("white_light", "light_smoothness", "albedo_smoothness", "material_smoothness"),
+            *("white_light", "albedo_smoothness", "material_smoothness"),
             *("light_anchor", "material_anchor", "albedo_anchor"),
         )
         require_least(self, "refine", counts | levels | rates | dict.fromkeys(weights, 0))

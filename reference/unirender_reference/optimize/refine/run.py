@@ -21,7 +21,7 @@ from unirender_reference.passes import derive_seed
 
 __all__ = ["RefineConfig", "RefineState", "refine"]
 
-LIGHT_WIDTH, TEXTURE_WIDTH = 0.1, 0.02  # of the smoothness priors
+TEXTURE_WIDTH = 0.02  # of the smoothness prior
 WEIGHT_SPP = 256  # of the pictures that say what the start explains
 HELD_OUT_SPP = 64  # always the same samples: differences between steps are sharper than the figure
 
@@ -151,22 +151,12 @@ class Fit:
                 value, slope = prior()
                 found[label] = value, {name: weight * slope}
 
-        light = to_map("environment", now["environment"], config.parametrisation)
-        logs = np.log(light)
-
-        def of_light(gradient: np.ndarray) -> np.ndarray:
-            return parameter_gradient("environment", now["environment"], gradient, config.parametrisation)
-
         def white() -> tuple[float, np.ndarray]:
-            value, slope = white_light(light)
-            return value, of_light(slope)
-
-        def smooth_light() -> tuple[float, np.ndarray]:
-            value, slope = smoothness(logs, LIGHT_WIDTH, circular=True)
-            return value, of_light(slope / light)
+            parameter, space = now["environment"], config.parametrisation
+            value, slope = white_light(to_map("environment", parameter, space))
+            return value, parameter_gradient("environment", parameter, slope, space)
 
         add("white_light", config.white_light, "environment", white)
-        add("light_smoothness", config.light_smoothness, "environment", smooth_light)
         add("albedo_smoothness", config.albedo_smoothness, "albedo", lambda: smoothness(now["albedo"], TEXTURE_WIDTH))
         for name in ("roughness", "metallic"):
             add(
