@@ -131,7 +131,6 @@ def test_the_fit_to_held_out_views_is_reported(views: Views, truth: Solution) ->
 PRIORS: dict[str, Name] = {
     "white_light": "environment",
     "albedo_smoothness": "albedo",
-    "material_smoothness": "roughness",
     "light_anchor": "environment",
     "albedo_anchor": "albedo",
     "material_anchor": "metallic",

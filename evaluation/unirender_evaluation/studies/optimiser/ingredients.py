@@ -99,7 +99,6 @@ def ingredients(seed: int = 0) -> tuple[Ingredient, ...]:
         ),
         refined("white-light", "light drawn to white", PRIORS, white_light=1.5e-3),
         refined("smooth-albedo", "smooth albedo", PRIORS, albedo_smoothness=0.015),
-        refined("smooth-materials", "smooth roughness and metallic", PRIORS, material_smoothness=0.03),
         refined("anchors", "maps held at the start", PRIORS, albedo_anchor=0.2, material_anchor=0.2, light_anchor=4e-3),
         grey("from-grey", "the full method's refinement", full.refine),
         grey("plain", f"plain loop, {PLAIN_ITERATIONS} steps", plain),

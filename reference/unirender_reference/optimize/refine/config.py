@@ -62,8 +62,6 @@ class RefineConfig:
     """Weight of NvDiffRec's regulariser: mean |E_c - mean E|."""
     albedo_smoothness: float = 0.0
     """Weight of the smoothness of the albedo."""
-    material_smoothness: float = 0.0
-    """Weight of the smoothness of roughness and metallic."""
     light_anchor: float = 0.0
     """Weight of the squared distance of the light's logarithm from the start."""
     material_anchor: float = 0.0
@@ -84,10 +82,7 @@ class RefineConfig:
         counts = {"iterations": 0, "spp": 1, "spp_gradient": 1, "depth": 2, "held_out_every": 0, "seed": 0}
         levels = {"albedo_levels": 1, "material_levels": 1, "light_levels": 1}
         rates = {"albedo_rate": 0, "roughness_rate": 0, "metallic_rate": 0, "light_rate": 0}
-        weights = (
-            *("white_light", "albedo_smoothness", "material_smoothness"),
-            *("light_anchor", "material_anchor", "albedo_anchor"),
-        )
+        weights = ("white_light", "albedo_smoothness", "light_anchor", "material_anchor", "albedo_anchor")
         require_least(self, "refine", counts | levels | rates | dict.fromkeys(weights, 0))
         require_one_of(self, "refine", {"loss": get_args(LossKind), "parametrisation": get_args(Space)})
         require_least(self, "refine", {"decay": 0}, above=True)

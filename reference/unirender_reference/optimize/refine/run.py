@@ -158,13 +158,6 @@ class Fit:
 
         add("white_light", config.white_light, "environment", white)
         add("albedo_smoothness", config.albedo_smoothness, "albedo", lambda: smoothness(now["albedo"], TEXTURE_WIDTH))
-        for name in ("roughness", "metallic"):
-            add(
-                f"{name}_smoothness",
-                config.material_smoothness,
-                name,
-                lambda name=name: smoothness(now[name], TEXTURE_WIDTH),
-            )
         anchors = (config.albedo_anchor, config.material_anchor, config.material_anchor, config.light_anchor)
         for name, weight in zip(NAMES, anchors, strict=True):
             add(f"{name}_anchor", weight, name, lambda name=name: anchor(now[name], first[name]))
