@@ -252,7 +252,6 @@ def test_linear_pictures_are_not_for_the_model(solution: Solution, data: Path, t
                 ("refine.held-out-every", "-1", "0 or more"),
                 ("refine.decay", "-1", "more than 0"),
                 ("refine.light-rate", "nan", "0 or more"),
-                ("refine.light-rows", "2", "4 or more, or 0"),
                 ("save-seconds", "-1", "0 or more"),
                 ("transport.pixels", "0", "16 or more"),
                 ("transport.smooth-light", "-1", "0 or more"),
@@ -283,7 +282,6 @@ def test_a_mesh_leaves_nothing_to_reconstruct(data: Path, tmp_path: Path):
         (["--texture-size", "1000000"], r"--texture-size 1000000: would take about [\d,]+ GiB of memory"),
         (["--light-rows", "9998"], r"--light-rows 9998: would take about [\d,]+ GiB"),
         (["--light-rows", "1000000", "--transport.no-enabled"], r"--light-rows 1000000: would take about"),
-        (["--refine.light-rows", "1000000"], r"--refine\.light-rows 1000000: would take about"),
     ],
 )
 def test_more_than_the_machine_has(data: Path, tmp_path: Path, arguments: list[str], message: str):

@@ -106,7 +106,7 @@ def test_a_state_of_something_else_is_refused(truth: Solution, tmp_path: Path) -
     path = tmp_path / "state.npz"
     RefineState.begin(truth, FAST).save(path)
     with pytest.raises(UnirenderError, match="belongs to another start or configuration"):
-        RefineState.load(path, truth, dataclasses.replace(FAST, light_rows=12))
+        RefineState.load(path, truth, dataclasses.replace(FAST, light_levels=1))
     path.write_bytes(b"nothing")
     with pytest.raises(UnirenderError, match="no readable state"):
         RefineState.load(path, truth, FAST)
@@ -224,7 +224,7 @@ def test_a_misspelled_choice_of_materials_is_refused(truth: Solution) -> None:
 def test_the_plain_loop_has_no_ingredient() -> None:
     plain = RefineConfig.plain()
     assert plain.spp == plain.spp_gradient == 16
-    assert (plain.one_sided, plain.uniform, plain.decay, plain.light_rows) == (False, False, 1, 0)
+    assert (plain.one_sided, plain.uniform, plain.decay) == (False, False, 1)
     assert plain.parametrisation == "linear"
     assert plain.albedo_levels == plain.material_levels == plain.light_levels == 1
 

@@ -6,8 +6,6 @@ from typing import Literal, get_args
 from unirender.errors import UsageError
 from unirender_reference.optimize.option_checks import require_least, require_one_of
 
-LEAST_LIGHT_ROWS = 4
-
 LossKind = Literal["log", "srgb", "linear", "slope"]
 Space = Literal["perceptual", "linear"]
 
@@ -56,8 +54,6 @@ class RefineConfig:
     """One step length for all texels of a level."""
     beta_2: float = 0.99
     """What Adam keeps of its second moment in a step; 0.999 in Mitsuba's and most others' default."""
-    light_rows: int = 0
-    """Rows of the light that is refined: the start is interpolated; 0: as many as the start has."""
     white_light: float = 0.0
     """Weight of NvDiffRec's regulariser: mean |E_c - mean E|."""
     albedo_smoothness: float = 0.0
@@ -89,10 +85,6 @@ class RefineConfig:
         require_least(self, "refine", {"beta_2": 0})
         if self.beta_2 >= 1:
             raise UsageError(f"--refine.beta-2 {self.beta_2}: expected less than 1")
-        if self.light_rows and self.light_rows < LEAST_LIGHT_ROWS:
-            raise UsageError(
-                f"--refine.light-rows {self.light_rows}: expected {LEAST_LIGHT_ROWS} or more, or 0 (as the start has)"
-            )
 
     @classmethod
     def plain(cls, iterations: int = 800) -> "RefineConfig":

@@ -16,7 +16,6 @@ from unirender_reference.optimize.numerics.descent import PyramidAdam
 from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.refine.parameters import NAMES, Name, to_map, to_parameter
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.transport.light_grid import interpolated_light
 
 
 @dataclass
@@ -38,12 +37,9 @@ class RefineState:
     @classmethod
     def begin(cls, start: Solution, config: RefineConfig) -> "RefineState":
         """The state before the first step."""
-        light = start.environment
-        if config.light_rows:
-            light = interpolated_light(light, config.light_rows)
         assert start.obj.roughness is not None
         assert start.obj.metallic is not None
-        maps = (start.obj.albedo, start.obj.roughness[..., None], start.obj.metallic[..., None], light)
+        maps = (start.obj.albedo, start.obj.roughness[..., None], start.obj.metallic[..., None], start.environment)
         first: dict[Name, np.ndarray] = {
             name: to_parameter(name, values, config.parametrisation) for name, values in zip(NAMES, maps, strict=True)
         }
