@@ -31,6 +31,7 @@ from unirender_reference.optimize.files.export import write_solution
 from unirender_reference.optimize.files.folder import write_views
 from unirender_reference.optimize.machine import require_cores, require_memory
 from unirender_reference.optimize.shape.placement import placed
+from unirender_reference.optimize.single.config import COLD_NORMALS
 from unirender_reference.optimize.single.picture import PictureInput, read_normals, read_picture_input, unit_normals
 from unirender_reference.optimize.single.pixels import make_picture
 from unirender_reference.optimize.single.render import rerendered
@@ -499,6 +500,8 @@ def test_one_picture(solution: Solution, tmp_path: Path, capsys: pytest.CaptureF
     assert (tmp_path / "out/history.jsonl").read_text().count("\n") >= 2
     said = capsys.readouterr().out
     assert f"rendered again: {meta['psnr_db']:.2f} dB" in said
+    assert said.endswith("assumed, since one picture does not tell it: metallic (0.5), the mean of albedo (0.25)\n")
+    assert meta["config"]["trust"] == dataclasses.asdict(COLD_NORMALS)
     again = channels_rgb(read_exr(tmp_path / "out/image.exr")[0])
     shown, given = image_srgb(unpremultiply(again, view.mask)), view.image
     error = np.average(((shown - given) ** 2).mean(-1), weights=view.mask[..., 0])
