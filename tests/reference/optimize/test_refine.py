@@ -12,9 +12,11 @@ from unirender.color import srgb_encode
 from unirender.errors import UnirenderError, UsageError
 from unirender_reference import backend
 from unirender_reference.optimize.multiview.config import OptimizeConfig
+from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.refine.parameters import Name
-from unirender_reference.optimize.refine.run import Fit, RefineConfig, RefineState, refine
+from unirender_reference.optimize.refine.run import Fit, refine
 from unirender_reference.optimize.refine.scene import TexturedScene, maps_of
+from unirender_reference.optimize.refine.state import RefineState
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.transport.config import TransportConfig
 from unirender_reference.optimize.transport.light_grid import interpolated_light
@@ -106,7 +108,7 @@ def test_a_state_of_something_else_is_refused(truth: Solution, tmp_path: Path) -
     path = tmp_path / "state.npz"
     RefineState.begin(truth, FAST).save(path)
     with pytest.raises(UnirenderError, match="belongs to another start or configuration"):
-        RefineState.load(path, truth, dataclasses.replace(FAST, light_levels=1))
+        RefineState.load(path, truth, dataclasses.replace(FAST, light_levels=3))
     path.write_bytes(b"nothing")
     with pytest.raises(UnirenderError, match="no readable state"):
         RefineState.load(path, truth, FAST)
@@ -148,14 +150,14 @@ def test_every_prior_reaches_its_map(views: Views, truth: Solution, field: str) 
         key: np.clip(value + rng.uniform(-0.1, 0.1, value.shape), -1.6, 0.95).astype(np.float32)
         for key, value in state.parameters.items()
     }
-    slopes = [slope[name] for _, slope in fit.priors(state).values() if name in slope]
-    move, step = rng.normal(size=slopes[0].shape), 1e-3
+    (weighted,) = [slope for own, _, slope in fit.priors(state).values() if own == name]
+    move, step = rng.normal(size=weighted.shape), 1e-3
 
     def total(scale: float) -> float:
         moved = dataclasses.replace(state, parameters={**state.parameters, name: state.parameters[name] + scale * move})
-        return 2.0 * sum(value for value, slope in fit.priors(moved).values() if name in slope)
+        return 2.0 * sum(value for own, value, _ in fit.priors(moved).values() if own == name)
 
-    along = float((slopes[0] * move).sum())
+    along = float((weighted * move).sum())
     assert along == pytest.approx((total(step) - total(-step)) / (2 * step), rel=0.02)
     assert along != 0
     fit.config = FAST

@@ -19,14 +19,12 @@ from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.views import Step, Views
 from unirender_reference.passes import derive_seed
 
-__all__ = ["RefineConfig", "RefineState", "refine"]
-
 TEXTURE_WIDTH = 0.02  # of the smoothness prior
 WEIGHT_SPP = 256  # of the pictures that say what the start explains
 HELD_OUT_SPP = 64  # always the same samples: differences between steps are sharper than the figure
 
+Map = Float[np.ndarray, "h w c"]
 Maps = Mapping[str, Float[np.ndarray, "..."]]
-Gradients = Mapping[Name, Float[np.ndarray, "h w c"]]
 
 
 def refine(
@@ -110,10 +108,9 @@ class Fit:
         """One step of Adam; returns the losses by name."""
         config = self.config
         values, gradients = self.pictures(state)
-        for name, (value, gradient) in self.priors(state).items():
-            values[name] = value
-            for key, part in gradient.items():
-                gradients[key] = gradients[key] + part
+        for label, (name, value, slope) in self.priors(state).items():
+            values[label] = value
+            gradients[name] = gradients[name] + slope
         remaining = config.decay ** (state.iteration / max(1, config.iterations))
         rates = (config.albedo_rate, config.roughness_rate, config.metallic_rate, config.light_rate)
         for name, rate in zip(NAMES, rates, strict=True):
@@ -126,7 +123,7 @@ class Fit:
             values["held_out_psnr"] = self._held_out.psnr(state)
         return values
 
-    def pictures(self, state: RefineState) -> tuple[dict[str, float], dict[Name, Float[np.ndarray, "h w c"]]]:
+    def pictures(self, state: RefineState) -> tuple[dict[str, float], dict[Name, Map]]:
         """The loss of the pictures with the fit in dB, and derivatives with respect to the parameters."""
         config, maps = self.config, state.maps(self.config)
         seed = derive_seed(config.seed, "refine", state.iteration)
@@ -141,24 +138,21 @@ class Fit:
             for name in NAMES
         }
 
-    def priors(self, state: RefineState) -> dict[str, tuple[float, Gradients]]:
-        """Value and weighted derivatives of every prior that has a weight."""
+    def priors(self, state: RefineState) -> dict[str, tuple[Name, float, Map]]:
+        """Of every prior that has a weight: the map that it is of, its value, and its weighted derivative."""
         config, now, first = self.config, state.parameters, state.first
-        found: dict[str, tuple[float, Gradients]] = {}
-
-        def add(label: str, weight: float, name: Name, prior: Callable[[], tuple[float, np.ndarray]]) -> None:
-            if weight:
-                value, slope = prior()
-                found[label] = value, {name: weight * slope}
-
-        def white() -> tuple[float, np.ndarray]:
-            parameter, space = now["environment"], config.parametrisation
-            value, slope = white_light(to_map("environment", parameter, space))
-            return value, parameter_gradient("environment", parameter, slope, space)
-
-        add("white_light", config.white_light, "environment", white)
-        add("albedo_smoothness", config.albedo_smoothness, "albedo", lambda: smoothness(now["albedo"], TEXTURE_WIDTH))
+        found: dict[str, tuple[Name, float, Map]] = {}
+        if config.white_light:
+            light, space = now["environment"], config.parametrisation
+            value, slope = white_light(to_map("environment", light, space))
+            slope = config.white_light * parameter_gradient("environment", light, slope, space)
+            found["white_light"] = "environment", value, slope
+        if config.albedo_smoothness:
+            value, slope = smoothness(now["albedo"], TEXTURE_WIDTH)
+            found["albedo_smoothness"] = "albedo", value, config.albedo_smoothness * slope
         anchors = (config.albedo_anchor, config.material_anchor, config.material_anchor, config.light_anchor)
         for name, weight in zip(NAMES, anchors, strict=True):
-            add(f"{name}_anchor", weight, name, lambda name=name: anchor(now[name], first[name]))
+            if weight:
+                value, slope = anchor(now[name], first[name])
+                found[f"{name}_anchor"] = name, value, weight * slope
         return found
