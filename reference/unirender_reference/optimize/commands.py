@@ -16,7 +16,7 @@ from unirender_reference.measure.output import ELSEWHERE, full_disk
 from unirender_reference.optimize.machine import require_cores
 from unirender_reference.optimize.multiview.config import OptimizeConfig
 from unirender_reference.optimize.option_checks import require_least
-from unirender_reference.optimize.single.config import SingleConfig
+from unirender_reference.optimize.single.config import SingleConfig, kept_note
 
 if TYPE_CHECKING:
     import numpy as np
@@ -248,12 +248,15 @@ class Optimize:
             seconds = time.perf_counter() - began
             again = rerendered(given, found, obj, self.input.name)
             meta = {"command": "optimize", "input": self.input, "init": self.init, "hdr": given.hdr, "mesh": self.mesh}
-            meta |= {"psnr_db": again.psnr_db, "config": dataclasses.asdict(self.single)}
+            priors, trust = self.single.resolved(obj is not None, start is not None)
+            config = dataclasses.replace(self.single, priors=priors, trust=trust)
+            meta |= {"psnr_db": again.psnr_db, "config": dataclasses.asdict(config)}
             with writing(self.out, ELSEWHERE):
                 write_result(folder, found, meta, again.image_linear)
                 again.strip.save(folder / "views.png")
                 (folder / "history.jsonl").write_text(history_text(steps), encoding="utf-8")
         print(f"{self.out}: {seconds:.1f} s; masked PSNR of the picture, rendered again: {again.psnr_db:.2f} dB")
+        print(kept_note(trust, start is not None))
         return 0
 
 

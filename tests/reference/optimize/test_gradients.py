@@ -91,7 +91,7 @@ def test_different_samples_remove_the_bias_of_a_squared_error(scene: TexturedSce
 
     def derived(seed: int, other: int) -> float:
         images = scene.image(maps, 1, seed)[..., :3]
-        found = scene.gradients(maps, 2 * (images - target), 1, other, ("environment",))["environment"]
+        found = scene.gradients(maps, 2 * (images - target), 1, other)["environment"]
         return float((found.astype(np.float64) * maps["environment"]).sum())
 
     apart = np.array([derived(seed, 1000 + seed) for seed in range(seeds)])

@@ -28,11 +28,7 @@ def views_of(displayed: np.ndarray, mask: np.ndarray | None = None, hdr: bool = 
 def test_derivative_is_that_of_the_value(kind: LossKind) -> None:
     x, t, step = pictures(0), pictures(1), 1e-3
     _, slope = pixel_loss(x, t, kind)
-    if kind == "relative":  # its denominator is held fixed
-        held = 1 / (x.astype(np.float64) + 0.01) ** 2
-        central = held * ((x + step - t) ** 2 - (x - step - t) ** 2) / (2 * step)
-    else:
-        central = (pixel_loss(x + step, t, kind)[0] - pixel_loss(x - step, t, kind)[0]) / (2 * step)
+    central = (pixel_loss(x + step, t, kind)[0] - pixel_loss(x - step, t, kind)[0]) / (2 * step)
     np.testing.assert_allclose(slope, central, rtol=0.01, atol=2e-3)
     assert np.abs(1.1 * slope - central).max() > 0.02  # the tolerance can tell
 
@@ -104,7 +100,7 @@ def test_pixels_that_say_one_or_more_have_no_say_in_the_scale() -> None:
     assert loss(loss.target - 0.1)[0] == ImageLoss(views)(loss.target - 0.1)[0] > 0
 
 
-def test_only_covered_pixels_count_unless_there_is_a_background() -> None:
+def test_only_covered_pixels_count() -> None:
     display = np.full((1, 2, 2, 3), 0.5, np.float32)
     mask = np.ones((1, 2, 2, 1), np.float32)
     mask[0, 0, 0] = 0
@@ -112,9 +108,8 @@ def test_only_covered_pixels_count_unless_there_is_a_background() -> None:
     other = loss.target.copy()
     other[0, 0, 0] = 3
     assert loss(other)[0] == 0
-    grey = np.full(3, 0.5, np.float32)
-    assert loss(loss.target, grey, mask)[0] == 0
-    assert loss(loss.target, grey, np.ones_like(mask))[0] > 0  # alpha where the mask has none
+    other[0, 1, 1] = 3
+    assert loss(other)[0] > 0
 
 
 def test_psnr_of_two_halves_is_free_of_their_noise() -> None:

@@ -128,13 +128,23 @@ def test_a_result_that_was_not_finished_is_written_again(whole: Path, tmp_path: 
     ("change", "named"),
     [
         ({"config": dataclasses.replace(CONFIG, seed=1)}, "config.seed"),
-        ({"config": dataclasses.replace(CONFIG, refine=dataclasses.replace(REFINE, spp=8))}, "config.refine"),
+        ({"config": dataclasses.replace(CONFIG, refine=dataclasses.replace(REFINE, spp=8))}, r"config\.refine\.spp;"),
         ({"init": flat_start(truth().obj, 17)}, "inputs.start"),
     ],
 )
 def test_another_run_is_refused(whole: Path, change: dict, named: str):
     with pytest.raises(UnirenderError, match=f"holds a run with other {named}"):
         run(whole, **change)
+
+
+def test_a_run_with_an_option_that_is_gone_is_refused(tmp_path: Path):
+    """As one that an earlier version began; the option is named, not its whole group."""
+    now = {"config": {"refine": {"spp": 4}}, "inputs": {}, "versions": {}}
+    with open_run(tmp_path, {**now, "config": {"refine": {"spp": 4, "demodulated": 0.0}}}):
+        pass
+    refused = pytest.raises(UnirenderError, match=r"holds a run with other config\.refine\.demodulated; expected")
+    with refused, open_run(tmp_path, now):
+        pass
 
 
 def test_a_run_that_stood_elsewhere_is_refused(whole: Path, tmp_path: Path):

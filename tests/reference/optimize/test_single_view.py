@@ -13,7 +13,15 @@ from unirender.color import image_srgb, srgb_decode, unpremultiply
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender.light.environment import resample_environment
-from unirender_reference.optimize.single.config import COLD, Priors, SingleConfig, Trust
+from unirender_reference.optimize.single.config import (
+    COLD,
+    COLD_MESH,
+    WARM_NORMALS,
+    Priors,
+    SingleConfig,
+    Trust,
+    kept_note,
+)
 from unirender_reference.optimize.single.fit import Fit, Unknowns
 from unirender_reference.optimize.single.pixels import make_picture
 from unirender_reference.optimize.single.run import optimize_image
@@ -252,6 +260,13 @@ def test_what_cannot_be_used_is_refused(picture: np.ndarray, truth: Intrinsics, 
             SingleConfig(**options)
     with pytest.raises(UnirenderError, match=r"--single\.light-rows 100000: would take about"):
         SingleConfig(light_rows=100_000)
+
+
+def test_what_a_result_has_of_its_start_is_named() -> None:
+    told = "since one picture does not tell it: "
+    assert kept_note(COLD_MESH, warm=False) == f"assumed, {told}metallic (0.5), the mean of albedo (0.25)"
+    assert kept_note(Trust(), warm=False) == f"assumed, {told}the mean of albedo (0.25)"
+    assert kept_note(WARM_NORMALS, warm=True) == f"as predicted, {told}metallic, roughness, albedo"
 
 
 def test_the_brightness_of_a_light_is_that_of_the_picture(small_fit: Fit) -> None:

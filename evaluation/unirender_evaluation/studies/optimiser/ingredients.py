@@ -75,7 +75,6 @@ def ingredients(seed: int = 0) -> tuple[Ingredient, ...]:
         refined("log", "NvDiffRec's log-tonemapped loss", loss="log"),
         refined("srgb", "squared error of display values", loss="srgb"),
         refined("linear", "squared error of radiance", loss="linear"),
-        refined("relative", "relative squared error", loss="relative"),
         refined("same-weights", "pixels count the same, however the start explains them", robust=False),
         refined("two-sided", "saturated pixels count as exact", one_sided=False),
         refined(
@@ -89,7 +88,6 @@ def ingredients(seed: int = 0) -> tuple[Ingredient, ...]:
         refined("linear-steps", "steps in linear albedo and light", parametrisation="linear"),
         refined("direct-light", "direct light only: no interreflection", depth=2),
         refined("same-samples", "picture and derivative share their samples", decorrelated=False),
-        refined("common-numbers", "every step draws the same samples", common_random_numbers=True),
         refined("constant-rates", "learning rates do not decay", decay=1.0),
         refined(
             "small-rates",
@@ -100,11 +98,7 @@ def ingredients(seed: int = 0) -> tuple[Ingredient, ...]:
             light_rate=full.refine.light_rate / 4,
         ),
         refined("white-light", "light drawn to white", PRIORS, white_light=1.5e-3),
-        refined("smooth-light", "smooth light", PRIORS, light_smoothness=1.5e-3),
         refined("smooth-albedo", "smooth albedo", PRIORS, albedo_smoothness=0.015),
-        refined("smooth-materials", "smooth roughness and metallic", PRIORS, material_smoothness=0.03),
-        refined("demodulated", "demodulated light", PRIORS, demodulated=2e-3),
-        refined("random-background", "random background", PRIORS, random_background=True),
         refined("anchors", "maps held at the start", PRIORS, albedo_anchor=0.2, material_anchor=0.2, light_anchor=4e-3),
         grey("from-grey", "the full method's refinement", full.refine),
         grey("plain", f"plain loop, {PLAIN_ITERATIONS} steps", plain),

@@ -132,7 +132,8 @@ def descend(
         every: iterations between two measures; the end is measured, too.
         first: points that were measured before.
     """
-    from unirender_reference.optimize.refine.run import RefineState, refine
+    from unirender_reference.optimize.refine.run import refine
+    from unirender_reference.optimize.refine.state import RefineState
 
     state, points = RefineState.begin(start, config), list(first)
 

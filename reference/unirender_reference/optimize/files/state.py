@@ -163,18 +163,22 @@ def _update(digest: Any, *arrays: np.ndarray | None) -> None:
 
 def _check_same(out: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
     """Refuses a folder whose run differs in what decides its result."""
-    differs = [
-        f"{group}.{key}"
-        for group in wanted
-        for key in sorted({*wanted[group], *found.get(group, {})})
-        if wanted[group].get(key) != found.get(group, {}).get(key)
-    ]
+    there, here = _flat(found), _flat(wanted)
+    differs = [key for key in sorted({*there, *here}) if there.get(key) != here.get(key)]
     if differs:
         shown = ", ".join(differs[:5])
         raise UnirenderError(
             f"{out}: holds a run with other {shown}; expected the same, to go on with it: choose another --out, or "
             "delete it"
         )
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested dicts as one: `config.refine.spp` -> its value."""
+    found = {}
+    for key, value in values.items():
+        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -59,6 +59,5 @@ class OptimizeConfig:
                 f"--texture-size {self.texture_size}": TEXEL_BYTES * self.texture_size**2,
                 f"--light-rows {self.light_rows}": columns
                 * (PAIR_BYTES * columns if self.transport.enabled else TEXEL_BYTES),
-                f"--refine.light-rows {self.refine.light_rows}": TEXEL_BYTES * 2.0 * self.refine.light_rows**2,
             }
         )

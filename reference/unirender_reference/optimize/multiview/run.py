@@ -21,7 +21,9 @@ from unirender_reference.optimize.machine import require_memory_for_pictures
 from unirender_reference.optimize.multiview.config import PIXEL_BYTES, OptimizeConfig
 from unirender_reference.optimize.multiview.exposure import divided_views, exposure_of_views, lit
 from unirender_reference.optimize.multiview.result import write_result
-from unirender_reference.optimize.refine.run import HeldOut, RefineConfig, RefineState, refine
+from unirender_reference.optimize.refine.config import RefineConfig
+from unirender_reference.optimize.refine.run import HeldOut, refine
+from unirender_reference.optimize.refine.state import RefineState
 from unirender_reference.optimize.refine.watch import FIGURE, Watch
 from unirender_reference.optimize.shape.uv import charted
 from unirender_reference.optimize.show.report import OnReport, Report

@@ -6,9 +6,7 @@ from typing import Literal, get_args
 from unirender.errors import UsageError
 from unirender_reference.optimize.option_checks import require_least, require_one_of
 
-LEAST_LIGHT_ROWS = 4
-
-LossKind = Literal["log", "srgb", "linear", "relative", "slope"]
+LossKind = Literal["log", "srgb", "linear", "slope"]
 Space = Literal["perceptual", "linear"]
 
 
@@ -34,8 +32,6 @@ class RefineConfig:
     """Longest path: 2 is direct light with its shadows, 4 has three bounces."""
     decorrelated: bool = True
     """Picture and derivative draw different samples; off: the same, with a biased gradient."""
-    common_random_numbers: bool = False
-    """Every iteration draws the same samples."""
     parametrisation: Space = "perceptual"
     """Steps in display values of albedo and logarithms of light, or in the linear values themselves."""
     albedo_rate: float = 0.01
@@ -58,28 +54,16 @@ class RefineConfig:
     """One step length for all texels of a level."""
     beta_2: float = 0.99
     """What Adam keeps of its second moment in a step; 0.999 in Mitsuba's and most others' default."""
-    light_rows: int = 0
-    """Rows of the light that is refined: the start is interpolated; 0: as many as the start has."""
     white_light: float = 0.0
     """Weight of NvDiffRec's regulariser: mean |E_c - mean E|."""
-    neutral_light: float = 0.0
-    """Weight of the same on logarithms, squared: free of scale."""
-    light_smoothness: float = 0.0
-    """Weight of the smoothness of the light's logarithm."""
     albedo_smoothness: float = 0.0
     """Weight of the smoothness of the albedo."""
-    material_smoothness: float = 0.0
-    """Weight of the smoothness of roughness and metallic."""
     light_anchor: float = 0.0
     """Weight of the squared distance of the light's logarithm from the start."""
     material_anchor: float = 0.0
     """Weight of the squared distance of roughness and metallic from the start."""
     albedo_anchor: float = 0.0
     """Weight of the squared distance of the albedo from the start."""
-    demodulated: float = 0.0
-    """Weight of NvDiffRecMC's light regulariser: the light on a white object shall be as bright as the picture."""
-    random_background: bool = False
-    """Pictures are compared over a colour drawn for each iteration."""
     held_out_every: int = 0
     """Iterations between measures of the fit to held-out views; 0: never."""
     seed: int = 0
@@ -94,20 +78,13 @@ class RefineConfig:
         counts = {"iterations": 0, "spp": 1, "spp_gradient": 1, "depth": 2, "held_out_every": 0, "seed": 0}
         levels = {"albedo_levels": 1, "material_levels": 1, "light_levels": 1}
         rates = {"albedo_rate": 0, "roughness_rate": 0, "metallic_rate": 0, "light_rate": 0}
-        weights = (
-            *("white_light", "neutral_light", "light_smoothness", "albedo_smoothness", "material_smoothness"),
-            *("light_anchor", "material_anchor", "albedo_anchor", "demodulated"),
-        )
+        weights = ("white_light", "albedo_smoothness", "light_anchor", "material_anchor", "albedo_anchor")
         require_least(self, "refine", counts | levels | rates | dict.fromkeys(weights, 0))
         require_one_of(self, "refine", {"loss": get_args(LossKind), "parametrisation": get_args(Space)})
         require_least(self, "refine", {"decay": 0}, above=True)
         require_least(self, "refine", {"beta_2": 0})
         if self.beta_2 >= 1:
             raise UsageError(f"--refine.beta-2 {self.beta_2}: expected less than 1")
-        if self.light_rows and self.light_rows < LEAST_LIGHT_ROWS:
-            raise UsageError(
-                f"--refine.light-rows {self.light_rows}: expected {LEAST_LIGHT_ROWS} or more, or 0 (as the start has)"
-            )
 
     @classmethod
     def plain(cls, iterations: int = 800) -> "RefineConfig":

@@ -3,11 +3,10 @@
 Notation: x is the rendered and t the given radiance of a pixel, linear and premultiplied; c is the pixel's coverage.
 A loss is the mean of e(x, t) over covered pixels and channels:
 
-    log       |T(x) - T(t)|, T(x) = srgb(log(1 + x)): NvDiffRec's (Munkberg et al. 2022, sec. 4)
-    srgb      (srgb(x) - srgb(t))^2
-    linear    (x - t)^2
-    relative  (x - t)^2 / (x + 0.01)^2, the denominator held fixed (Lehtinen et al. 2018)
-    slope     (srgb'(t) (x - t))^2
+    log     |T(x) - T(t)|, T(x) = srgb(log(1 + x)): NvDiffRec's (Munkberg et al. 2022, sec. 4)
+    srgb    (srgb(x) - srgb(t))^2
+    linear  (x - t)^2
+    slope   (srgb'(t) (x - t))^2
 
 x is a Monte Carlo estimate. Where the derivative of e is linear in x (linear, slope) the expected gradient is that of
 the noise-free picture; the others are biased, most where x is noisiest. `slope` is `srgb` to first order.
@@ -26,7 +25,6 @@ from unirender_reference.optimize.numerics.tone import tone_slope
 from unirender_reference.optimize.refine.config import LossKind
 from unirender_reference.optimize.views import View, Views
 
-EPSILON = 0.01  # of the relative loss
 LEAST_ERROR = 0.002  # display values: half a step of 8 bits; of the scale of errors
 
 Images = Float[np.ndarray, "n h w 3"]
@@ -55,26 +53,14 @@ class ImageLoss:
         if one_sided:
             self.saturated = np.stack([views.saturated(view) for view in pictures]) & (self.coverage > 0)
 
-    def __call__(
-        self,
-        images: Images,
-        background: Float[np.ndarray, "3"] | None = None,
-        alpha: Float[np.ndarray, "n h w 1"] | None = None,
-    ) -> tuple[float, Images]:
+    def __call__(self, images: Images) -> tuple[float, Images]:
         """Value, and derivative with respect to the images.
 
         Args:
             images: premultiplied linear radiance.
-            background: radiance behind both pictures (NvDiffRec's random background); None: black.
-            alpha: coverage of the images, where a background is given.
         """
-        x, t = images, self.target
-        if background is not None and alpha is not None:
-            x, t = x + (1 - alpha) * background, t + (1 - self.coverage) * background
-        error, slope = pixel_loss(x, t, self.kind)
-        counted = ~(self.saturated & (x > t))
-        if background is None:
-            counted &= self.coverage > 0
+        error, slope = pixel_loss(images, self.target, self.kind)
+        counted = (self.coverage > 0) & ~(self.saturated & (images > self.target))
         value = float((self._share * error).sum(where=counted, dtype=np.float64)) / self._count
         return value, (np.where(counted, self._share * slope, 0) / self._count).astype(np.float32)
 
@@ -141,9 +127,6 @@ def pixel_loss(x: Images, t: Images, kind: LossKind) -> tuple[Images, Images]:
             return difference**2, (2 * difference * tone_slope(x)).astype(np.float32)
         case "linear":
             return (x - t) ** 2, 2 * (x - t)
-        case "relative":
-            weight = 1 / (x + EPSILON) ** 2
-            return weight * (x - t) ** 2, 2 * weight * (x - t)
         case "slope":
             weight = (tone_slope(t) ** 2).astype(np.float32)
             return weight * (x - t) ** 2, 2 * weight * (x - t)

@@ -1,9 +1,8 @@
 """What is assumed of materials and light beyond the pictures: each prior is a value and its derivative.
 
 Notation: rho(u) = sqrt(u^2 + w^2) - w (Charbonnier) is quadratic below the width w and grows linearly above, so that
-edges of textures and bright lights cost little more than slopes. Smoothness is the mean of rho over differences of
-neighbouring texels, along columns and rows. A light's columns are a circle. Everything is a mean over texels: weights
-do not depend on resolution.
+edges of textures cost little more than slopes. Smoothness is the mean of rho over differences of neighbouring texels,
+along columns and rows. Everything is a mean over texels: weights do not depend on resolution.
 """
 
 import numpy as np
@@ -12,19 +11,16 @@ from jaxtyping import Float
 Map = Float[np.ndarray, "h w"] | Float[np.ndarray, "h w c"]
 
 
-def smoothness(values: Map, width: float, circular: bool = False) -> tuple[float, Map]:
+def smoothness(values: Map, width: float) -> tuple[float, Map]:
     """Mean of rho over the differences between neighbours, and its derivative.
 
     Args:
         values: a map.
         width: of rho, in units of the map.
-        circular: whether the last column is a neighbour of the first.
     """
     total, slope = 0.0, np.zeros_like(values)
-    right = np.roll(values, -1, axis=1) - values
-    if not circular:
-        right[:, -1] = 0
-    down = np.zeros_like(values)
+    right, down = np.zeros_like(values), np.zeros_like(values)
+    right[:, :-1] = values[:, 1:] - values[:, :-1]
     down[:-1] = values[1:] - values[:-1]
     for difference, axis in ((right, 1), (down, 0)):
         root = np.sqrt(difference**2 + width**2)
@@ -40,12 +36,6 @@ def white_light(environment: Float[np.ndarray, "h w 3"]) -> tuple[float, Float[n
     sign = np.sign(difference)
     slope = (sign - sign.mean(axis=-1, keepdims=True)) / environment.size
     return float(np.abs(difference).mean(dtype=np.float64)), slope.astype(np.float32)
-
-
-def neutral_light(log_light: Float[np.ndarray, "h w 3"]) -> tuple[float, Float[np.ndarray, "h w 3"]]:
-    """Mean square of what the logarithm of a texel's channels differs from their mean; scale-free."""
-    difference = log_light - log_light.mean(axis=-1, keepdims=True)
-    return float((difference**2).mean(dtype=np.float64)), 2 * difference / log_light.size
 
 
 def anchor(values: Map, first: Map) -> tuple[float, Map]:

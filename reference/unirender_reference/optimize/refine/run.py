@@ -12,21 +12,19 @@ from jaxtyping import Float
 from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.refine.losses import ImageLoss
 from unirender_reference.optimize.refine.parameters import NAMES, Name, parameter_gradient, to_map, to_parameter
-from unirender_reference.optimize.refine.priors import anchor, neutral_light, smoothness, white_light
+from unirender_reference.optimize.refine.priors import anchor, smoothness, white_light
 from unirender_reference.optimize.refine.scene import TexturedScene
 from unirender_reference.optimize.refine.state import RefineState
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.views import Step, Views
 from unirender_reference.passes import derive_seed
 
-__all__ = ["RefineConfig", "RefineState", "refine"]
-
-LIGHT_WIDTH, TEXTURE_WIDTH = 0.1, 0.02  # of the smoothness priors
+TEXTURE_WIDTH = 0.02  # of the smoothness prior
 WEIGHT_SPP = 256  # of the pictures that say what the start explains
 HELD_OUT_SPP = 64  # always the same samples: differences between steps are sharper than the figure
 
+Map = Float[np.ndarray, "h w c"]
 Maps = Mapping[str, Float[np.ndarray, "..."]]
-Gradients = Mapping[Name, Float[np.ndarray, "h w c"]]
 
 
 def refine(
@@ -110,10 +108,9 @@ class Fit:
         """One step of Adam; returns the losses by name."""
         config = self.config
         values, gradients = self.pictures(state)
-        for name, (value, gradient) in self.priors(state).items():
-            values[name] = value
-            for key, part in gradient.items():
-                gradients[key] = gradients[key] + part
+        for label, (name, value, slope) in self.priors(state).items():
+            values[label] = value
+            gradients[name] = gradients[name] + slope
         remaining = config.decay ** (state.iteration / max(1, config.iterations))
         rates = (config.albedo_rate, config.roughness_rate, config.metallic_rate, config.light_rate)
         for name, rate in zip(NAMES, rates, strict=True):
@@ -126,85 +123,36 @@ class Fit:
             values["held_out_psnr"] = self._held_out.psnr(state)
         return values
 
-    def pictures(self, state: RefineState) -> tuple[dict[str, float], dict[Name, Float[np.ndarray, "h w c"]]]:
+    def pictures(self, state: RefineState) -> tuple[dict[str, float], dict[Name, Map]]:
         """The loss of the pictures with the fit in dB, and derivatives with respect to the parameters."""
         config, maps = self.config, state.maps(self.config)
-        seed = derive_seed(config.seed, "refine", 0 if config.common_random_numbers else state.iteration)
+        seed = derive_seed(config.seed, "refine", state.iteration)
         other = derive_seed(seed, "gradient") if config.decorrelated else seed
         images = self.scene.image(maps, config.spp, seed)
-        background = np.random.default_rng(seed).random(3).astype(np.float32) if config.random_background else None
-        value, image_gradient = self.loss(images[..., :3], background, images[..., 3:])
+        value, image_gradient = self.loss(images[..., :3])
         found = self.scene.gradients(maps, image_gradient, config.spp_gradient, other)
         values = {"loss": value, "psnr": self.loss.psnr(images[..., :3])}
-        if config.demodulated:
-            value, light = self._demodulated(maps, seed)
-            values["demodulated"] = value
-            found["environment"] = found["environment"] + config.demodulated * light
         gradients = {name: found[name].reshape(state.parameters[name].shape) for name in NAMES}
         return values, {
             name: parameter_gradient(name, state.parameters[name], gradients[name], config.parametrisation)
             for name in NAMES
         }
 
-    def priors(self, state: RefineState) -> dict[str, tuple[float, Gradients]]:
-        """Value and weighted derivatives of every prior that has a weight."""
+    def priors(self, state: RefineState) -> dict[str, tuple[Name, float, Map]]:
+        """Of every prior that has a weight: the map that it is of, its value, and its weighted derivative."""
         config, now, first = self.config, state.parameters, state.first
-        found: dict[str, tuple[float, Gradients]] = {}
-
-        def add(label: str, weight: float, name: Name, prior: Callable[[], tuple[float, np.ndarray]]) -> None:
-            if weight:
-                value, slope = prior()
-                found[label] = value, {name: weight * slope}
-
-        light = to_map("environment", now["environment"], config.parametrisation)
-        logs = np.log(light)
-
-        def of_light(gradient: np.ndarray) -> np.ndarray:
-            return parameter_gradient("environment", now["environment"], gradient, config.parametrisation)
-
-        def white() -> tuple[float, np.ndarray]:
-            value, slope = white_light(light)
-            return value, of_light(slope)
-
-        def neutral() -> tuple[float, np.ndarray]:
-            value, slope = neutral_light(logs)
-            return value, of_light(slope / light)
-
-        def smooth_light() -> tuple[float, np.ndarray]:
-            value, slope = smoothness(logs, LIGHT_WIDTH, circular=True)
-            return value, of_light(slope / light)
-
-        add("white_light", config.white_light, "environment", white)
-        add("neutral_light", config.neutral_light, "environment", neutral)
-        add("light_smoothness", config.light_smoothness, "environment", smooth_light)
-        add("albedo_smoothness", config.albedo_smoothness, "albedo", lambda: smoothness(now["albedo"], TEXTURE_WIDTH))
-        for name in ("roughness", "metallic"):
-            add(
-                f"{name}_smoothness",
-                config.material_smoothness,
-                name,
-                lambda name=name: smoothness(now[name], TEXTURE_WIDTH),
-            )
+        found: dict[str, tuple[Name, float, Map]] = {}
+        if config.white_light:
+            light, space = now["environment"], config.parametrisation
+            value, slope = white_light(to_map("environment", light, space))
+            slope = config.white_light * parameter_gradient("environment", light, slope, space)
+            found["white_light"] = "environment", value, slope
+        if config.albedo_smoothness:
+            value, slope = smoothness(now["albedo"], TEXTURE_WIDTH)
+            found["albedo_smoothness"] = "albedo", value, config.albedo_smoothness * slope
         anchors = (config.albedo_anchor, config.material_anchor, config.material_anchor, config.light_anchor)
         for name, weight in zip(NAMES, anchors, strict=True):
-            add(f"{name}_anchor", weight, name, lambda name=name: anchor(now[name], first[name]))
+            if weight:
+                value, slope = anchor(now[name], first[name])
+                found[f"{name}_anchor"] = name, value, weight * slope
         return found
-
-    def _demodulated(self, maps: Maps, seed: int) -> tuple[float, Float[np.ndarray, "eh ew 3"]]:
-        """NvDiffRecMC's |Y(light) - V(picture)|: the light that a white object reflects, against the picture's value.
-
-        (Hasselgren et al. 2022, eq. 8): Y is the mean over channels of the light, V the largest channel of the picture.
-        """
-        config = self.config
-        white = {**maps, "albedo": np.ones_like(maps["albedo"]), "metallic": np.zeros_like(maps["metallic"])}
-        images = self.scene.image(white, config.spp, derive_seed(seed, "white"))
-        luminance = images[..., :3].mean(axis=-1, keepdims=True)
-        value = self.loss.target.max(axis=-1, keepdims=True)
-        difference = np.log1p(luminance) - np.log1p(value)
-        covered = self.loss.coverage > 0
-        count = float(self.loss.coverage.sum())
-        slope = np.where(covered, np.sign(difference) / (1 + luminance) / 3 / count, 0)
-        gradient = np.repeat(slope, 3, axis=-1).astype(np.float32)
-        own = derive_seed(seed, "white gradient")
-        found = self.scene.gradients(white, gradient, config.spp_gradient, own, ("environment",))
-        return float(np.abs(difference).sum(where=covered)) / count, found["environment"]

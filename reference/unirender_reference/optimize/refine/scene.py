@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
-from unirender_reference.optimize.refine.parameters import NAMES, Name
+from unirender_reference.optimize.refine.parameters import NAMES
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.solution_scene import solution_scene
 from unirender_reference.optimize.views import View
@@ -86,12 +86,7 @@ class TexturedScene:
         return finite_pass(draw, Counters(), "textured scene")
 
     def gradients(
-        self,
-        maps: Maps,
-        image_gradient: Float[np.ndarray, "n h w 3"],
-        spp: int,
-        seed: int,
-        wrt: Sequence[Name] = NAMES,
+        self, maps: Maps, image_gradient: Float[np.ndarray, "n h w 3"], spp: int, seed: int
     ) -> dict[str, Float[np.ndarray, "..."]]:
         """Derivatives of sum(image_gradient * image) with respect to maps, each of its map's shape.
 
@@ -100,7 +95,6 @@ class TexturedScene:
             image_gradient: derivative of a loss with respect to the radiance (premultiplied) of `image`.
             spp: samples per pixel.
             seed: equal seeds draw equal samples.
-            wrt: what to differentiate with respect to.
 
         Raises:
             UnirenderError: the image gradient has another size or is not finite, or derivatives stay NaN.
@@ -111,7 +105,7 @@ class TexturedScene:
                 f"textured scene: got an image gradient of shape {image_gradient.shape}, expected finite {expected}"
             )
         for attempt in range(NAN_ATTEMPTS + 1):
-            attached = self._show(maps, wrt)
+            attached = self._show(maps, NAMES)
             self._backward(np.concatenate(list(image_gradient), axis=1), spp, pass_seed(seed, attempt))
             found = {name: gradient(tensor) for name, tensor in attached.items()}
             if all(np.isfinite(values).all() for values in found.values()):

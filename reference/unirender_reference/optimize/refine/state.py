@@ -16,7 +16,6 @@ from unirender_reference.optimize.numerics.descent import PyramidAdam
 from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.refine.parameters import NAMES, Name, to_map, to_parameter
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.transport.light_grid import interpolated_light
 
 
 @dataclass
@@ -38,12 +37,9 @@ class RefineState:
     @classmethod
     def begin(cls, start: Solution, config: RefineConfig) -> "RefineState":
         """The state before the first step."""
-        light = start.environment
-        if config.light_rows:
-            light = interpolated_light(light, config.light_rows)
         assert start.obj.roughness is not None
         assert start.obj.metallic is not None
-        maps = (start.obj.albedo, start.obj.roughness[..., None], start.obj.metallic[..., None], light)
+        maps = (start.obj.albedo, start.obj.roughness[..., None], start.obj.metallic[..., None], start.environment)
         first: dict[Name, np.ndarray] = {
             name: to_parameter(name, values, config.parametrisation) for name, values in zip(NAMES, maps, strict=True)
         }
@@ -68,12 +64,8 @@ class RefineState:
 
     def save(self, path: Path) -> None:
         """Writes an npz file; a killed run leaves the file that was there, or the new one."""
-        arrays: dict[str, Any] = {f"parameter.{name}": values for name, values in self.parameters.items()}
-        arrays |= {f"first.{name}": values for name, values in self.first.items()}
-        for name, moments in self.moments.items():
-            arrays |= {f"moment.{name}.{index}": array for index, array in enumerate(moments.arrays())}
         with whole_file(path) as file:
-            np.savez(file, iteration=self.iteration, **arrays)
+            np.savez(file, **self._arrays())
 
     @classmethod
     def load(cls, path: Path, start: Solution, config: RefineConfig) -> "RefineState":
@@ -90,15 +82,12 @@ class RefineState:
             raise UnirenderError(
                 f"{path}: no readable state of a refinement ({error}); delete it to begin anew"
             ) from error
-        expected = {f"parameter.{name}": values.shape for name, values in state.parameters.items()}
-        for name, moments in state.moments.items():
-            expected |= {f"moment.{name}.{index}": array.shape for index, array in enumerate(moments.arrays())}
-        for name, shape in expected.items():
-            found = arrays[name].shape if name in arrays else None
-            if found != shape:
+        found, expected = ({name: array.shape for name, array in own.items()} for own in (arrays, state._arrays()))
+        for name in sorted({*found, *expected}):
+            if found.get(name) != expected.get(name):
                 raise UnirenderError(
-                    f"{path}: {name} has shape {found}, expected {shape}; the state belongs to another start or "
-                    "configuration: delete it to begin anew"
+                    f"{path}: {name} has shape {found.get(name)}, expected {expected.get(name)}; the state belongs to "
+                    "another start or configuration: delete it to begin anew"
                 )
         state.iteration = int(arrays["iteration"])
         for name in NAMES:
@@ -106,3 +95,12 @@ class RefineState:
             own = [arrays[f"moment.{name}.{index}"] for index in range(len(state.moments[name].arrays()))]
             state.moments[name].restore(own, state.iteration)
         return state
+
+    def _arrays(self) -> dict[str, Any]:
+        """All that a file holds, by name."""
+        arrays: dict[str, Any] = {"iteration": np.array(self.iteration)}
+        arrays |= {f"parameter.{name}": values for name, values in self.parameters.items()}
+        arrays |= {f"first.{name}": values for name, values in self.first.items()}
+        for name, moments in self.moments.items():
+            arrays |= {f"moment.{name}.{index}": array for index, array in enumerate(moments.arrays())}
+        return arrays

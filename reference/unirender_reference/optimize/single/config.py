@@ -135,6 +135,11 @@ class SingleConfig:
         entries = min(self.pixels, self.coarse_pixels) * 2.0 * self.light_rows**2
         require_memory({f"--single.light-rows {self.light_rows}": MATRIX_BYTES * entries})
 
+    def resolved(self, known_mesh: bool, warm: bool) -> tuple[Priors, Trust]:
+        """Its own widths and trust, or those of `fitted`; arguments as there."""
+        priors, trust = fitted(known_mesh, warm)
+        return self.priors or priors, self.trust or trust
+
 
 def _words(values: Iterable[float]) -> str:
     return " ".join(f"{value:g}" for value in values)
@@ -164,3 +169,19 @@ def fitted(known_mesh: bool, warm: bool) -> tuple[Priors, Trust]:
         return Priors(), WARM_MESH if known_mesh else WARM_NORMALS
     cold = Priors(albedo=0.5, tint=0.15, metallic=0.4, roughness=0.35, light=1.5)
     return cold, COLD_MESH if known_mesh else COLD_NORMALS
+
+
+def kept_note(trust: Trust, warm: bool) -> str:
+    """A sentence on what of a result is its start's: whoever looks at the maps takes it for found.
+
+    Args:
+        trust: that the result was made with.
+        warm: the start is a prediction; else it is `COLD`.
+    """
+    kept = [name for name in ("metallic", "roughness", "albedo") if getattr(trust, name) == 0]
+    if "albedo" not in kept:
+        kept.append("the mean of albedo")
+    if warm:
+        return f"as predicted, since one picture does not tell it: {', '.join(kept)}"
+    shown = [f"{name} ({COLD[name.rpartition(' ')[2]]:g})" for name in kept]
+    return f"assumed, since one picture does not tell it: {', '.join(shown)}"

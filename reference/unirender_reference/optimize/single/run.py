@@ -19,7 +19,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.light.environment import resample_environment
 from unirender_reference.optimize.exposure import exposed, exposure_of
 from unirender_reference.optimize.shape.placement import check_in_picture
-from unirender_reference.optimize.single.config import COLD, SingleConfig, fitted
+from unirender_reference.optimize.single.config import COLD, SingleConfig
 from unirender_reference.optimize.single.fit import Fit, Unknowns
 from unirender_reference.optimize.single.inflate import silhouette_normals
 from unirender_reference.optimize.single.pixels import PicturePixels, make_picture
@@ -85,8 +85,7 @@ def optimize_image(
             on_step(Step("single view", count, time.monotonic() - began, values))
 
     maps = _start_maps(mask, init)
-    priors, trust = fitted(geometry is not None, init is not None)
-    priors, trust = config.priors or priors, config.trust or trust
+    priors, trust = config.resolved(geometry is not None, init is not None)
     maps["normal"] = _start_normals(mask, camera, normal, geometry, init)
     shape = (config.light_rows, 2 * config.light_rows)
 

@@ -97,10 +97,8 @@ def trace_points(scene: Any, views: Sequence[View], samples: int, seed: int, mos
     columns = [np.concatenate(parts) for parts in zip(*found, strict=True)]
     if not len(columns[0]):
         raise UnirenderError("geometry: the mesh is in no covered pixel; expected the object that the pictures show")
-    if most is not None and len(columns[0]) > most:
-        kept = np.sort(np.random.default_rng(seed).choice(len(columns[0]), most, replace=False))
-        columns = [column[kept] for column in columns]
-    return SurfacePoints(*columns)
+    points = SurfacePoints(*columns)
+    return points if most is None else points.some(most, seed)
 
 
 def picture_points(

@@ -109,10 +109,9 @@ def light_transport(
         surface = _Surface(scene, points, rows, cell_samples)
         for node, roughness in enumerate(NODES):
             own = derive_seed(seed, "lobes", rows.start, node)
-            for matrix, part in zip(
-                matrices[4 + 2 * node :], _by_lobe(surface, basis, grid, roughness, own), strict=False
-            ):
-                matrix[rows] += part
+            gloss, schlick_weighted = _by_lobe(surface, basis, grid, roughness, own)
+            matrices[4 + 2 * node][rows] += gloss
+            matrices[5 + 2 * node][rows] += schlick_weighted
     if coverage is not None:
         for matrix in matrices:
             matrix *= (coverage / points.coverage)[:, None]
