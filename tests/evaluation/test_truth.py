@@ -33,9 +33,9 @@ from unirender_evaluation.suites.truth_file import (
 )
 from unirender_evaluation.truth.make import make_truth, quality_summary, with_sha256
 from unirender_evaluation.truth.object import ObjectJob, object_hash, render_object
-from unirender_evaluation.truth.render import good_spp, render_to_ceiling, stored_ceiling_db
+from unirender_evaluation.truth.render import render_to_ceiling, stored_ceiling_db
 from unirender_reference.noise import noise_floor_db
-from unirender_reference.passes import SAMPLES_PER_PASS, Estimate, pass_count
+from unirender_reference.passes import Estimate
 
 
 def test_stored_noise_survives_half_floats(tmp_path: Path) -> None:
@@ -75,16 +75,6 @@ def test_sampling_goes_on_until_the_ceiling_is_reached(kind: Kind) -> None:
     assert np.abs((found.mean - 0.5) / np.sqrt(unit / found.spp)).max() < 6
     short = replace(spec, max_spp=320)
     assert render_to_ceiling(render, mask, short, 7, kind)[0].floor_db < target, "max_spp ends it"
-
-
-@pytest.mark.parametrize("wanted", [1, 9, 256, 1000, 20_000, 60_000])
-def test_sample_counts_make_full_passes(wanted: int) -> None:
-    """Passes of whole grids, a multiple of the batches, each within a wavefront, at most 15 % more than asked for."""
-    spec = read_spec("tiny")
-    spp, most = good_spp(wanted, spec), SAMPLES_PER_PASS // spec.resolution**2
-    assert wanted <= spp <= max(1.15 * wanted, wanted + spec.batches)
-    assert spp // pass_count(spp, spec.batches, most) <= most
-    assert pass_count(spp, spec.batches, most) <= spec.batches * (spp // (spec.batches * most) + 1)
 
 
 @pytest.mark.parametrize("kind", ["image", "specular", "diffuse"])

@@ -239,7 +239,7 @@ def slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         yield tmp_path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_slurm_jobs_are_processes_with_one_thread_for_each_core(slurm: Path) -> None:
     with connect("slurm:1") as executor:
         assert executor.workers == 2

@@ -9,8 +9,6 @@ import signal
 import subprocess
 import sys
 import tarfile
-from collections.abc import Callable
-from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ import numpy as np
 import pytest
 import trimesh
 from inline_executor import Inline
+from stored_groups import Stored
 
 from unirender.errors import UnirenderError
 from unirender.exr import write_exr
@@ -30,9 +29,9 @@ from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.faults import FileFailure, FileNotSeen, ObjectFault, blamed_on
 from unirender_reference.folder_lock import LOCK, locked
 from unirender_reference.mesh_folder import MeshFile
-from unirender_reference.plan import GroupPlan, plan_groups
+from unirender_reference.plan import plan_groups
 from unirender_reference.processes import TimeLimitPassed
-from unirender_reference.shards import JOURNAL, FloorCount, RenderedGroup, shard_name
+from unirender_reference.shards import JOURNAL, FloorCount, shard_name
 from unirender_reference.workers import WorkerDied
 
 SIZE, SPP = 8, 16
@@ -52,21 +51,6 @@ def meshes(tmp_path: Path) -> Path:
     for number in range(3):
         trimesh.creation.box((1, 1, 0.5 + 0.2 * number)).export(folder / f"{number}.obj")
     return folder
-
-
-class Stored(Inline):
-    """An executor whose groups are there at once, as bytes that depend on the plan: for tests of what is recorded."""
-
-    def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Future:
-        return super().submit(_stored if function is render_group else function, *arguments)
-
-
-def _stored(_: DatasetConfig, plan: GroupPlan) -> RenderedGroup:
-    if plan.mesh is not None and plan.mesh.path.is_symlink():
-        raise FileNotSeen(f"mesh {plan.mesh.name}: no such file")
-    if plan.mesh is not None and "f " not in plan.mesh.path.read_text():
-        raise FileFailure("has no faces")
-    return RenderedGroup(f"object{plan.index}_g0", {"json": str(plan.render_seed).encode()}, plan.samples, 0, 0.1, 0.1)
 
 
 def manifest(out: Path) -> dict[str, Any]:

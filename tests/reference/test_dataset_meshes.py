@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from inline_executor import Inline
 from PIL import Image
+from stored_groups import Stored
 from trimesh.visual.material import PBRMaterial
 from trimesh.visual.texture import TextureVisuals
 
@@ -105,7 +106,7 @@ def test_an_interrupted_run_ends_at_the_same_bytes(
 ) -> None:
     """Failed files of a finished shard are not tried again."""
     monkeypatch.setattr("unirender_reference.dataset.SHARD_GROUPS", 2)
-    once = generate(config(tmp_path / "once", folder), executor=Inline())
+    once = generate(config(tmp_path / "once", folder), executor=Stored())
     begun: list[str] = []
 
     def stop_at_the_sixth(_: DatasetConfig, plan: Any) -> None:
@@ -114,10 +115,10 @@ def test_an_interrupted_run_ends_at_the_same_bytes(
             raise RuntimeError("pulled the plug")
 
     with pytest.raises(RuntimeError, match="pulled the plug"):
-        generate(config(tmp_path / "twice", folder), executor=Inline(stop_at_the_sixth))
+        generate(config(tmp_path / "twice", folder), executor=Stored(stop_at_the_sixth))
     stored = json.loads((tmp_path / "twice" / "manifest.json").read_text())["shards"]
     assert len(stored) == 2
-    executor = Inline()
+    executor = Stored()
     again = generate(config(tmp_path / "twice", folder), executor=executor)
     assert executor.begun == 7 - 2 * len(stored)
     assert again.failures == once.failures
@@ -193,21 +194,21 @@ def test_a_changed_folder_is_noticed(tmp_path: Path) -> None:
     meshes = tmp_path / "meshes"
     for seed in range(2):
         write_solid(meshes / f"b{seed}.obj", seed)
-    generate(config(tmp_path / "out", meshes), executor=Inline())
+    generate(config(tmp_path / "out", meshes), executor=Stored())
     with (meshes / "b1.obj").open("a") as stream:
         stream.write("# repaired\n")
     with pytest.raises(
         UnirenderError, match=r"shard-000000\.tar was made from other files .* delete shard-000000\.tar"
     ):
-        generate(config(tmp_path / "out", meshes), executor=Inline())
+        generate(config(tmp_path / "out", meshes), executor=Stored())
     (tmp_path / "out" / "shard-000000.tar").unlink()
-    assert generate(config(tmp_path / "out", meshes), executor=Inline()).groups == 2
+    assert generate(config(tmp_path / "out", meshes), executor=Stored()).groups == 2
     write_solid(meshes / "b2.obj", 2)  # at the end: the last shard grows
-    assert generate(config(tmp_path / "out", meshes), executor=Inline()).groups == 3
-    assert generate(config(tmp_path / "out", meshes), executor=Inline()).groups == 0
+    assert generate(config(tmp_path / "out", meshes), executor=Stored()).groups == 3
+    assert generate(config(tmp_path / "out", meshes), executor=Stored()).groups == 0
     write_solid(meshes / "a.obj", 3)
     with pytest.raises(UnirenderError, match=r"made from other files"):
-        generate(config(tmp_path / "out", meshes, objects=3), executor=Inline())
+        generate(config(tmp_path / "out", meshes, objects=3), executor=Stored())
 
 
 def test_a_file_that_kills_its_worker_is_listed(folder: Path, tmp_path: Path) -> None:
@@ -215,11 +216,11 @@ def test_a_file_that_kills_its_worker_is_listed(folder: Path, tmp_path: Path) ->
         if plan.mesh is None or plan.mesh.name == "model.obj":
             raise WorkerDied("the worker died")
 
-    report = generate(config(tmp_path / "out", str(folder / "*model.obj")), executor=Inline(die))
+    report = generate(config(tmp_path / "out", str(folder / "*model.obj")), executor=Stored(die))
     assert [(failure.file, failure.reason) for failure in report.failures] == [("model.obj", "the worker died")]
     assert len(json.loads((tmp_path / "out" / "manifest.json").read_text())["shards"]) == 1
     with pytest.raises(UnirenderError, match="the worker died; complete shards are kept"):  # no file to blame
-        generate(config(tmp_path / "none", None, objects=1), executor=Inline(die))
+        generate(config(tmp_path / "none", None, objects=1), executor=Stored(die))
 
 
 def test_groups_are_stored_as_they_come(tmp_path: Path) -> None:
@@ -231,7 +232,7 @@ def test_groups_are_stored_as_they_come(tmp_path: Path) -> None:
     def look(*_: object) -> None:
         sizes.append(sum(path.stat().st_size for path in (tmp_path / "out").glob(".shard*.part")))
 
-    generate(config(tmp_path / "out", tmp_path / "meshes", resolution=64), executor=Inline(look))
+    generate(config(tmp_path / "out", tmp_path / "meshes"), executor=Stored(look))
     assert sizes[0] == 0
     assert sizes[-1] > 0
     assert not list((tmp_path / "out").glob(".*"))

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from inline_executor import Inline
 
-from unirender.cli import main
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import channels_rgb, read_exr_bytes
@@ -241,15 +240,3 @@ def test_denoised_pictures_are_marked_and_nearer_to_the_truth(tmp_path: Path) ->
     )
     assert gain > 1
     assert len(GroupDataset(tmp_path / "True")) == 1
-
-
-def test_the_command_line_knows_the_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for options, words in (
-        (["--denoise", "--split", "test"], "truth is never denoised"),
-        (["--materials", "maps", "--vary", "basis"], "--materials maps needs --vary independent"),
-        (["--no-turn-lights"], "--no-turn-lights: got it without --lights"),
-    ):
-        with pytest.raises(SystemExit) as stop:
-            main(["dataset", "--out", str(tmp_path), *options])
-        assert stop.value.code == 2
-        assert words in capsys.readouterr().err

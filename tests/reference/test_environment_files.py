@@ -17,12 +17,9 @@ from unirender.files import new_folder, write_result
 from unirender.intrinsics import Intrinsics
 from unirender.light.environment import resample_environment
 from unirender.light.surface_light import diffuse_light, specular_light
-from unirender_reference.dataset import render_group
-from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.lights import load_light
 from unirender_reference.lights.files import BYTES_A_TEXEL, BYTES_OF_NONE
 from unirender_reference.lights.light import area_resampled
-from unirender_reference.plan import plan_groups
 
 Environment = Float[np.ndarray, "h w 3"]
 
@@ -51,14 +48,6 @@ def test_a_written_environment_is_read_as_the_same_light(
 ) -> None:
     environment = peaked_environment()
     np.testing.assert_array_equal(read_light(write(tmp_path, environment)), environment)
-
-
-def test_an_environment_of_a_data_set_is_read_as_the_same_light(tmp_path: Path) -> None:
-    config = DatasetConfig(1, 3, 8, "basis", tmp_path, spp=4, workers=1)
-    data = render_group(config, plan_groups(config)[0]).members["l0.environment.exr"]
-    (tmp_path / "light.exr").write_bytes(data)
-    channels, _ = read_exr(tmp_path / "light.exr")
-    np.testing.assert_array_equal(read_light(tmp_path / "light.exr"), np.stack([channels[c] for c in "RGB"], -1))
 
 
 def test_any_other_map_is_taken_as_areas(tmp_path: Path) -> None:

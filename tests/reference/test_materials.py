@@ -128,22 +128,6 @@ def compare(a: Estimate, b: Estimate, mask: np.ndarray) -> ZTest:
     return z_test(*parts, mask, rounding=2e-3, alpha=1e-3)
 
 
-def test_constant_maps_render_like_values() -> None:
-    """Another surface in Mitsuba (textured), the same picture."""
-    constant = {"roughness": np.full((4, 4), 0.3, np.float32), "metallic": np.full((2, 3), 0.7, np.float32)}
-    base = scenes.sphere(subdivisions=3)
-    uv = np.zeros((len(base.vertices), 2), np.float32)
-    renderer = Renderer(dataclasses.replace(base, uv=uv, **constant), resolution=24)
-    mask = renderer.geometry(16).require("mask")["mask"]
-    light = scenes.environment()
-    value = renderer.image(light, 0.3, 0.7, 256, seed=1)
-    assert compare(renderer.image(light, None, None, 256, seed=2), value, mask).passed
-    glossy = renderer.specular(light, 0.3, 512, seed=1)
-    assert compare(renderer.specular(light, None, 512, seed=2), glossy, mask).passed
-    assert not compare(renderer.specular(light, 0.3 * 1.12, 512, seed=2), glossy, mask).passed
-    assert not compare(renderer.image(light, None, 0.95, 256, seed=2), value, mask).passed
-
-
 def wavy_normals() -> np.ndarray:
     """Normals of a smooth surface at the square's vertices; the world's axes, first row on top."""
     row, column = np.meshgrid(*[np.linspace(0, 1, GRID)] * 2, indexing="ij")
@@ -170,7 +154,7 @@ def front_light() -> np.ndarray:
 
 @pytest.mark.slow
 def test_surfaces_are_shaded_at_the_mapped_normal(front_light: np.ndarray) -> None:
-    """A normal map, here on a mirrored square, renders like a mesh with its normals at the vertices: image, s and d."""
+    """A normal map, here on a mirrored square, renders like a mesh with its normals at the vertices."""
     world = wavy_normals()
     tangent = resampled(world)[:, ::-1] * np.array([-1, 1, 1], np.float32)
     mapped = Renderer(quad(True, normal_map=np.ascontiguousarray(tangent)), resolution=16)
@@ -179,16 +163,32 @@ def test_surfaces_are_shaded_at_the_mapped_normal(front_light: np.ndarray) -> No
     mask = (bent.geometry(16).require("mask")["mask"] > 0.999).astype(np.float32)
     normal = bent.geometry(256).require("normal")["normal"]
     assert worst(mapped.geometry(256), "normal", normal, mask[..., 0] > 0) < 5e-3
-    draws = {
-        "image": lambda renderer, seed: renderer.image(front_light, 0.4, 0.5, 128, seed),
-        "specular": lambda renderer, seed: renderer.specular(front_light, 0.4, 128, seed),
-        "diffuse": lambda renderer, seed: renderer.diffuse(front_light, 512, seed),
-    }
-    for name, draw in draws.items():
-        right = draw(bent, 2)
-        result = compare(draw(mapped, 1), right, mask)
-        assert result.passed, f"{name}: {result}"
-        assert not compare(draw(twin, 1), right, mask).passed, name
+    right = bent.image(front_light, 0.4, 0.5, 128, seed=2)
+    result = compare(mapped.image(front_light, 0.4, 0.5, 128, seed=1), right, mask)
+    assert result.passed, str(result)
+    assert not compare(twin.image(front_light, 0.4, 0.5, 128, seed=1), right, mask).passed
+
+
+@pytest.mark.parametrize("surface", ["principled", "mirror", "white"])
+def test_every_surface_is_seen_by_its_normal_map(surface: materials.Surface) -> None:
+    """eval of the surface as shown: light that the mapped normal mirrors, and light that the square's own mirrors."""
+    mi = mitsuba()
+    lean = np.radians(20)
+    tangent = np.tile(np.array([np.sin(lean), 0, np.cos(lean)], np.float32), (2, 2, 1))
+    values = {"roughness": 0.3} if surface == "mirror" else {"roughness": 0.3, "metallic": 1.0}
+    hit = facing_hit()
+    hit.wi = mi.Vector3f(0, 0, 1)
+
+    def value(obj: MeshObject, degrees: float) -> float:
+        shown = Renderer(obj, resolution=4).scene.show(surface, {} if surface == "white" else values)
+        angle = np.radians(degrees)
+        towards = mi.Vector3f(float(np.sin(angle)), 0.0, float(np.cos(angle)))
+        return float(np.array(shown.shapes()[0].bsdf().eval(mi.BSDFContext(), hit, towards))[0, 0])
+
+    assert value(quad(), 0) > value(quad(), 40)
+    assert value(quad(normal_map=tangent), 40) > value(quad(normal_map=tangent), -5)
+    if surface == "white":
+        assert value(quad(normal_map=tangent), 40) == pytest.approx(np.cos(lean) / np.pi, rel=1e-4)
 
 
 def facing_hit() -> Any:
@@ -276,12 +276,13 @@ def test_normals_face_the_viewer_by_one_rule_with_and_without_a_normal_map(monke
 
 
 def test_a_sample_of_maps_says_so_and_hashes_them() -> None:
-    obj = quad(roughness=texture(2, 8, 8), metallic=texture(3, 8, 8), normal_map=bumps(4))
+    obj = quad(roughness=texture(2, 8, 8), metallic=texture(3, 8, 8))
     spec = SceneSpec(obj, scenes.light(1), None, 0.5, resolution=16)
     sample = render_sample(spec, 64)
     assert (sample.provenance["roughness"], sample.provenance["metallic"]) == ("map", "0.5")
     assert np.ptp(sample.intrinsics.require("roughness")["roughness"]) > 0.3
-    hashes = {scene_hash(spec)}
+    obj = dataclasses.replace(obj, normal_map=bumps(4))
+    hashes = {scene_hash(dataclasses.replace(spec, obj=obj))}
     for name in ("roughness", "metallic", "normal_map"):
         other = getattr(obj, name).copy()
         other[[0, 1]] = other[[1, 0]]
@@ -301,25 +302,29 @@ def test_the_hash_of_an_object_without_maps_is_over_its_mesh_and_base_colour_alo
 
 
 @pytest.mark.parametrize(
-    ("surface", "outgoing"), [("diffuse_lobe", 1.5), ("dielectric_lobe", -1.2), ("schlick_lobe", -1.2)]
+    ("surface", "outgoing"),
+    [("principled", -1.2), ("mirror", -1.2), ("diffuse_lobe", 1.5), ("dielectric_lobe", -1.2), ("schlick_lobe", -1.2)],
 )
-def test_lobes_follow_roughness_values_and_maps(surface: materials.Surface, outgoing: float) -> None:
+def test_surfaces_follow_values_and_maps(surface: materials.Surface, outgoing: float) -> None:
     """eval of the surface as shown: back towards grazing light (retro-reflection), or near its mirror direction."""
     mi = mitsuba()
-    renderer = Renderer(quad(roughness=np.full((2, 2), 0.3, np.float32)), resolution=4)
+    constant = {"roughness": np.full((2, 2), 0.3, np.float32), "metallic": np.full((2, 3), 0.7, np.float32)}
+    renderer = Renderer(quad(**constant), resolution=4)
 
-    def value(roughness: float | None) -> float:
+    def value(roughness: float | None, metallic: float | None = None) -> float:
         hit = facing_hit()
         hit.wi = unit_direction(2.0)
-        bsdf = renderer.scene.show(surface, {"roughness": roughness}).shapes()[0].bsdf()
+        values = {"roughness": roughness} | ({"metallic": metallic} if surface == "principled" else {})
+        bsdf = renderer.scene.show(surface, values).shapes()[0].bsdf()
         return float(np.array(bsdf.eval(mi.BSDFContext(), hit, unit_direction(outgoing)))[0, 0])
 
     def unit_direction(x: float) -> object:
         return mi.Vector3f(*unit(np.array([x, 0.1, 1.0])).tolist())
 
-    assert value(None) == pytest.approx(value(0.3), rel=1e-5)
-    assert value(0.3) > 0
-    assert value(0.8) != pytest.approx(value(0.3), rel=1e-2)
+    assert value(None) == pytest.approx(value(0.3, 0.7), rel=1e-5)
+    assert value(0.3, 0.7) > 0
+    assert value(0.8, 0.7) != pytest.approx(value(0.3, 0.7), rel=1e-2)
+    assert (value(None, 0.1) == pytest.approx(value(None), rel=1e-2)) == (surface != "principled")
 
 
 @pytest.mark.parametrize(

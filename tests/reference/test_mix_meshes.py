@@ -48,7 +48,7 @@ def flat_normals(piece: Piece) -> np.ndarray:
     return normal / np.linalg.norm(normal, axis=-1, keepdims=True)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(3))
 def test_normals_stay_those_of_the_faces(tmp_path, seed):
     """Of icosahedra, whose faces look along no axis: they are stretched by the inverse transpose."""
     model = read_model(write_solid(tmp_path, "a", trimesh.creation.icosahedron()))
@@ -228,8 +228,8 @@ def test_a_stopped_run_goes_on_with_the_same_files(tmp_path, monkeypatch):
     """Stopped while a mix is written, which leaves nothing of it; another seed makes other shapes."""
     meshes = folder_of_boxes(tmp_path)
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    report = mix_meshes(MixMeshes((str(meshes),), whole, count=6, seed=3))
-    assert (report.made, report.refused, report.too_large) == (6, [], 0)
+    report = mix_meshes(MixMeshes((str(meshes),), whole, count=4, seed=3))
+    assert (report.made, report.refused, report.too_large) == (4, [], 0)
     calls = []
 
     def full_disk(*arguments):
@@ -240,27 +240,27 @@ def test_a_stopped_run_goes_on_with_the_same_files(tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("unirender_reference.mix_folder.write_obj", full_disk)
         with pytest.raises(UnirenderError, match=r"mix-3-00002: cannot be written \(disk full\); mend that"):
-            mix_meshes(MixMeshes((str(meshes),), stopped, count=6, seed=3))
+            mix_meshes(MixMeshes((str(meshes),), stopped, count=4, seed=3))
     assert sorted(p.name for p in stopped.iterdir()) == ["mix-3-00000", "mix-3-00001", "mix.json"]
     (stopped / ".mix-3-00002.killed").mkdir()
     (stopped / ".mix.json.killed.partial").write_text("{")
-    assert mix_meshes(MixMeshes((str(meshes),), stopped, count=6, seed=3)).made == 4
+    assert mix_meshes(MixMeshes((str(meshes),), stopped, count=4, seed=3)).made == 2
     assert files(whole) == files(stopped)
     assert not list(stopped.glob(".mix*"))
-    mix_meshes(MixMeshes((str(meshes),), tmp_path / "another", count=6, seed=4))
+    mix_meshes(MixMeshes((str(meshes),), tmp_path / "another", count=4, seed=4))
     assert [len(v) for v in shapes(whole)] != [len(v) for v in shapes(tmp_path / "another")]
     for path in sorted(whole.rglob("*.obj")):
         obj = load_mesh(path)  # as a data set reads them
         assert obj.roughness is None
         assert obj.metallic is None
     firsts = [p.read_text().splitlines()[0] for p in sorted(whole.rglob("*.obj"))]
-    assert {*firsts[:4]} == {f"# made of meshes/box{i}.obj" for i in range(4)}  # each before any comes again
+    assert {*firsts} == {f"# made of meshes/box{i}.obj" for i in range(4)}  # each before any comes again
 
 
 def test_borrowed_pictures_are_named(tmp_path):
     """Each OBJ names the meshes whose pictures it has: of two boxes with pictures, by their first texels."""
     meshes = folder_of_boxes(tmp_path)
-    mix_meshes(MixMeshes((str(meshes),), tmp_path / "out", count=40))
+    mix_meshes(MixMeshes((str(meshes),), tmp_path / "out", count=12))
     own = {read_texel(meshes / f"box{i}.png"): f"box{i}.obj" for i in (1, 3)}
     borrowed = 0
     for folder in sorted((tmp_path / "out").glob("mix-*")):
@@ -268,7 +268,7 @@ def test_borrowed_pictures_are_named(tmp_path):
         named = [line for line in text.splitlines() if line.startswith("#")]
         assert {own[read_texel(p)] for p in folder.glob("*.png")} <= {line.split("/")[-1] for line in named}
         borrowed += any("with a picture of" in line for line in named)
-    assert 0 < borrowed < 40
+    assert 0 < borrowed < 12
 
 
 def read_texel(path) -> tuple[int, ...]:

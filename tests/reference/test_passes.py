@@ -193,18 +193,33 @@ def test_passes_come_in_numbers_that_make_groups() -> None:
 
 
 def test_samples_are_divided_into_the_fewest_full_grids() -> None:
-    """40 in 4 batches: 10 are no grid, 8 are 2 x 4. A seed is the same in every process."""
-    assert [pass_count(*asked) for asked in ((40, 4, 64), (100, 1, 64), (13, 8, 64))] == [5, 4, 13]
+    """40 in 4 batches: 10 are no grid, 8 are 2 x 4. A seed is the same in every process.
+
+    67 samples would be 67 passes of one sample each, not stratified at all; small passes that the wavefront asks for
+    are right.
+    """
+    asked = ((40, 4, 64), (100, 1, 64), (13, 8, 64), (32, 1, 1 << 20), (2048, 8, 1 << 20), (67, 1, 1))
+    assert [pass_count(*of) for of in asked] == [5, 4, 13, 2, 8, 67]
     assert next_spp(3, 8, 64) == 8
     for spp, batches, said in (
         (67, 1, "use 64 or 70"),
+        (8 * 67, 8, "use 531 or 539"),
         (5, 0, "5 in 0 batches"),
         (0, 0, "0 in 0 batches"),
         (7, 8, "at least one sample in each"),
     ):
         with pytest.raises(UnirenderError, match=said):
             pass_count(spp, batches, 1 << 20)
+    for better in (64, 70):
+        assert pass_count(better, 1, 1 << 20) <= MOST_SPLITS
     assert derive_seed(7, "pass", 0, 1) == 17919641
+
+
+def test_more_passes_than_anybody_waits_for_are_refused_at_once() -> None:
+    """Finding how to divide them would take as long."""
+    with pytest.raises(UnirenderError, match=r"spp: got 1\d+, expected at most 64,000,000, "):
+        pass_count(10**20, 1, 64)
+    assert pass_count(64 * module.MOST_PASSES, 1, 64) == module.MOST_PASSES
 
 
 def test_groups_are_means_of_successive_passes() -> None:
@@ -233,7 +248,7 @@ def test_variance_of_groups_is_that_of_passes() -> None:
 
 
 def test_memory_does_not_grow_with_the_samples(scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of 256 passes, 32 pictures are the result, and one or two are alive besides."""
+    """Of 128 passes, 32 pictures are the result, and one or two are alive besides."""
     monkeypatch.setattr(module, "SAMPLES_PER_PASS", SIZE**2)
     genuine, drawn, alive = module._render, [], []
 
@@ -244,9 +259,9 @@ def test_memory_does_not_grow_with_the_samples(scene, monkeypatch: pytest.Monkey
         return picture
 
     monkeypatch.setattr(module, "_render", render)
-    passes, _ = integrator_passes(scene, path_integrator(2), 256, 7, BATCHES, Counters())
+    passes, _ = integrator_passes(scene, path_integrator(2), 128, 7, BATCHES, Counters())
     assert np.shape(passes) == (MOST_KEPT, SIZE, SIZE, 4)
-    assert len(drawn) == 256
+    assert len(drawn) == 128
     assert max(alive) <= 2
 
 

@@ -26,7 +26,7 @@ from unirender_reference.render import (
     scene_hashes,
 )
 from unirender_reference.scene import MOST_RADIANCE, envmap_data, sensor_at, sensor_dict
-from unirender_reference.shapes import bounding_sphere, make_object
+from unirender_reference.shapes import bounding_sphere
 
 SIZE = 32
 
@@ -108,51 +108,49 @@ def test_equal_seeds_are_bit_identical_and_others_differ(renderer: Renderer) -> 
 
 def test_edited_scene_equals_a_loaded_one(renderer: Renderer) -> None:
     """Surfaces, parameters and lights of other sizes leave nothing behind."""
-    obj = renderer.obj
-    for shape, roughness, metallic in (((8, 16), 0.1, 0.9), ((20, 40), 0.7, 0.2)):
-        light = scenes.environment(3, shape)
-        for bsdf, depth, part, render in (
-            (
-                materials.principled_bsdf(obj.albedo, roughness, metallic),
-                IMAGE_DEPTH,
-                "image",
-                lambda light=light, r=roughness, m=metallic: renderer.image(light, r, m, 16, batches=1),
-            ),
-            (
-                materials.mirror_bsdf(roughness),
-                DIRECT_DEPTH,
-                "specular",
-                lambda light=light, r=roughness: renderer.specular(light, r, 16, batches=1),
-            ),
-            (
-                materials.white_bsdf(),
-                DIRECT_DEPTH,
-                "diffuse",
-                lambda light=light: renderer.diffuse(light, 16, batches=1),
-            ),
-        ):
-            loaded = scene.load_scene(obj, bsdf, light, renderer.camera, SIZE)
-            drawn = passes.render_passes(loaded, depth, 16, passes.derive_seed(0, part), 1, passes.Counters())
-            estimate = passes.mean_estimate if part == "image" else passes.ratio_estimate
-            expected = estimate(*drawn, 1).mean
-            assert np.array_equal(render().mean, expected), part
-            assert not np.array_equal(renderer.specular(light, 0.4, 16, batches=1).mean, expected)  # another scene
+    obj, other, light = renderer.obj, scenes.environment(3, (8, 16)), scenes.environment(3, (20, 40))
+    for bsdf, depth, part, render in (
+        (
+            materials.principled_bsdf(obj.albedo, 0.1, 0.9),
+            IMAGE_DEPTH,
+            "image",
+            lambda light, r: renderer.image(light, r, 0.9, 16, batches=1),
+        ),
+        (
+            materials.mirror_bsdf(0.1),
+            DIRECT_DEPTH,
+            "specular",
+            lambda light, r: renderer.specular(light, r, 16, batches=1),
+        ),
+        (
+            materials.white_bsdf(),
+            DIRECT_DEPTH,
+            "diffuse",
+            lambda light, _: renderer.diffuse(light, 16, batches=1),
+        ),
+    ):
+        loaded = scene.load_scene(obj, bsdf, light, renderer.camera, SIZE)
+        drawn = passes.render_passes(loaded, depth, 16, passes.derive_seed(0, part), 1, passes.Counters())
+        estimate = passes.mean_estimate if part == "image" else passes.ratio_estimate
+        expected = estimate(*drawn, 1).mean
+        assert not np.array_equal(render(other, 0.7).mean, expected), part
+        assert np.array_equal(render(light, 0.1).mean, expected), part
 
 
-def test_all_buffers_share_one_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_buffers_share_one_scene(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     """Loading builds an acceleration structure: once for an object, whatever is rendered of it."""
     loaded = []
     genuine = scene.load_scene
     monkeypatch.setattr(scene, "load_scene", lambda *args: loaded.append(args) or genuine(*args))
-    renderer, light = Renderer(scenes.sphere(), resolution=8), scenes.environment()
+    light = scenes.environment()
     renderer.geometry(16)
     for environment in (light, 2 * light):
         renderer.diffuse(environment, 16, batches=1)
         renderer.specular(environment, 0.5, 16, batches=1)
         renderer.image(environment, 0.5, 0.5, 16, batches=1)
-    assert len(loaded) == 1
+    assert not loaded
     Renderer(scenes.sphere(), resolution=8).geometry(16)
-    assert len(loaded) == 2
+    assert len(loaded) == 1
 
 
 def test_geometry_reads_the_object_whatever_was_rendered_last(renderer: Renderer) -> None:
@@ -247,7 +245,7 @@ def test_one_batch_states_no_variance(renderer: Renderer) -> None:
     assert renderer.diffuse(scenes.environment(), 16, batches=1).variance is None
 
 
-def test_nan_pixels_are_rendered_again_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nan_pixels_are_rendered_again_and_counted(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     """A Mitsuba that returns NaN in one pixel of its first render, as it does about once in 500 renders."""
     mi = backend.mitsuba()
     genuine, calls = mi.render, []
@@ -259,58 +257,23 @@ def test_nan_pixels_are_rendered_again_and_counted(monkeypatch: pytest.MonkeyPat
             picture[10, 11, 1] = np.nan
         return picture
 
-    renderer = Renderer(scenes.sphere(), resolution=SIZE)
+    before = renderer.counters.nan_pixels
     clean = renderer.image(scenes.environment(), 0.5, 0.5, 16, batches=1)
     monkeypatch.setattr(mi, "render", render)
     repaired = renderer.image(scenes.environment(), 0.5, 0.5, 16, batches=1)
-    assert (clean.nan_pixels, repaired.nan_pixels, renderer.counters.nan_pixels) == (0, 1, 1)
+    assert (clean.nan_pixels, repaired.nan_pixels, renderer.counters.nan_pixels - before) == (0, 1, 1)
     assert len(set(calls)) == 2
     differs = np.argwhere((clean.mean != repaired.mean).any(axis=-1))
     assert differs.tolist() == [[10, 11]]
     assert repaired.mean[10, 11, 1] > 0
 
 
-def test_pixels_that_stay_nan_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pixels_that_stay_nan_are_an_error(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     mi = backend.mitsuba()
     genuine = mi.render
     monkeypatch.setattr(mi, "render", lambda *args, **options: np.array(genuine(*args, **options)) * np.nan)
     with pytest.raises(UnirenderError, match="stay NaN after 8 seeds"):
-        Renderer(scenes.sphere(), resolution=8).diffuse(scenes.environment(), 16, batches=1)
-
-
-@pytest.mark.parametrize(
-    ("spp", "batches", "count"),
-    [(64, 1, 1), (36, 1, 1), (1024, 8, 16), (2048, 8, 8), (64, 8, 8), (7, 1, 7), (32, 1, 2)],
-)
-def test_passes_divide_the_samples_into_full_grids(spp: int, batches: int, count: int) -> None:
-    assert passes.pass_count(spp, batches, 1 << 20) == count
-
-
-def test_passes_bound_the_wavefront() -> None:
-    assert passes.pass_count(1 << 14, 1, 1 << 10) == 1 << 4
-
-
-@pytest.mark.parametrize(
-    ("spp", "batches", "most", "advice"),
-    [(67, 1, 1 << 20, "use 64 or 70"), (8 * 67, 8, 1 << 20, "use 531 or 539"), (11, 1, 1 << 20, "use 10 or 12")],
-)
-def test_samples_that_fall_apart_into_many_passes_are_refused(spp: int, batches: int, most: int, advice: str) -> None:
-    """67 samples would be 67 passes of one sample each, not stratified at all."""
-    with pytest.raises(UnirenderError, match=advice):
-        passes.pass_count(spp, batches, most)
-    for better in (int(word) for word in advice.split() if word.isdigit()):
-        assert passes.pass_count(better, batches, most) <= passes.MOST_SPLITS * batches
-
-
-def test_more_passes_than_anybody_waits_for_are_refused_at_once() -> None:
-    """Finding how to divide them would take as long."""
-    with pytest.raises(UnirenderError, match=r"spp: got 1\d+, expected at most 64,000,000, "):
-        passes.pass_count(10**20, 1, 64)
-    assert passes.pass_count(64 * passes.MOST_PASSES, 1, 64) == passes.MOST_PASSES
-
-
-def test_small_passes_that_the_wavefront_asks_for_are_not_refused() -> None:
-    assert passes.pass_count(67, 1, 1) == 67
+        renderer.diffuse(scenes.environment(), 16, batches=1)
 
 
 def test_the_camera_in_the_header_is_that_of_the_contract() -> None:
@@ -387,13 +350,12 @@ def test_sample_is_complete_and_shares_exposure_between_materials_and_seeds(rend
     assert {"mitsuba", "variant", "spp", "seed", "camera", "nan_pixels"} <= set(sample.provenance)
 
 
-def test_a_renderer_of_another_scene_is_refused() -> None:
-    """An object with maps has the name of the one without, and is another object."""
-    obj, light = make_object(1, "train"), scenes.light(1)
-    renderer = Renderer(obj, resolution=8)
-    spec = SceneSpec(obj, light, 0.3, 0.6, resolution=8)
+def test_a_renderer_of_another_scene_is_refused(renderer: Renderer) -> None:
+    """An object of another colour has the same name, and is another object."""
+    obj = renderer.obj
+    spec = SceneSpec(obj, scenes.light(1), 0.3, 0.6, resolution=SIZE)
     changes: dict[str, dict[str, Any]] = {
-        "object": {"obj": make_object(1, "train", maps=True)},
+        "object": {"obj": dataclasses.replace(obj, albedo=obj.albedo / 2)},
         "camera": {"camera": Camera(20.0)},
         "resolution": {"resolution": 9},
     }
@@ -404,7 +366,7 @@ def test_a_renderer_of_another_scene_is_refused() -> None:
         with pytest.raises(UnirenderError, match=f"another: {other}.*leave `renderer` out"):
             render_sample(wrong, 16, 0, renderer)
     copied = dataclasses.replace(spec, obj=dataclasses.replace(obj, vertices=obj.vertices.copy()))
-    assert render_sample(copied, 16, 0, renderer).provenance["scene"] == scene_hash(spec)
+    assert render_sample(copied, 128, 0, renderer).provenance["scene"] == scene_hash(spec)
 
 
 def test_the_hash_does_not_depend_on_the_type_of_a_number() -> None:
@@ -424,21 +386,16 @@ def test_geometry_takes_the_next_full_grid(renderer: Renderer, spp: int) -> None
         np.testing.assert_array_equal(picture, renderer.geometry(taken, 1).require(name)[name])
 
 
-def test_a_sample_takes_any_samples_that_its_image_takes() -> None:
-    spec = SceneSpec(scenes.sphere(), scenes.light(1), 0.3, 0.6, resolution=8)
-    assert render_sample(spec, 704).provenance["spp"] == "704"
-
-
 def test_the_brightest_light_has_a_finite_variance(renderer: Renderer) -> None:
     light = np.full((4, 8, 3), MOST_RADIANCE, np.float32)
-    variance = renderer.image(light, 0.2, 1.0, 64).variance
+    variance = renderer.image(light, 0.2, 1.0, 128).variance
     assert variance is not None
     assert np.isfinite(variance).all()
     with pytest.raises(UnirenderError, match="at most 1e"):
-        renderer.image(light * np.float32(1.01), 0.2, 1.0, 64)
+        renderer.image(light * np.float32(1.01), 0.2, 1.0, 128)
 
 
-@pytest.mark.parametrize("fov_deg", [0.001, 0.01, 168.0])
+@pytest.mark.parametrize("fov_deg", [0.001, 168.0])
 def test_objects_between_the_clips_of_extreme_cameras(fov_deg: float) -> None:
     """Mitsuba's far clip lies nearer than a camera of 0.01 degrees, its near clip behind the front of the object."""
     renderer = Renderer(scenes.sphere((1.0, 1.0, 1.0), subdivisions=4), Camera(fov_deg), 16)

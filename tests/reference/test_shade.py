@@ -68,7 +68,7 @@ def flat_pixels(intrinsics: Intrinsics) -> np.ndarray:
     return same[..., None].astype(np.float32)
 
 
-@pytest.mark.parametrize(("roughness", "metallic"), [(0.15, 1.0), (0.4, 0.5), (0.8, 0.0)])
+@pytest.mark.parametrize(("roughness", "metallic"), [(0.15, 1.0), (0.8, 0.0)])
 def test_constant_light_returns_the_directional_albedo(roughness: float, metallic: float) -> None:
     """White furnace: what our own BSDF reflects of a light of 1, by quadrature."""
     intrinsics, light = maps(roughness, metallic, (1, 1, 1)), np.ones((4, 8, 3), np.float32)

@@ -1,4 +1,4 @@
-"""Derivatives of `shade`: against autograd of an independent BSDF, against finite differences, and put to use."""
+"""Derivatives of `shade`: against autograd of an independent BSDF and against finite differences."""
 
 import inspect
 from typing import Any
@@ -233,36 +233,6 @@ def test_derivatives_with_shadows_agree_with_finite_differences() -> None:
 
     assert gap(projected(obj)).max() < 4, dict(zip(PARAMETERS, gap(projected(obj)), strict=True))
     assert (gap(projected(None))[[0, 4]] > 8).all()  # derivatives that know no shadows
-
-
-def test_gradient_descent_recovers_a_material() -> None:
-    """40 steps of Adam on one base colour and one roughness, from a shaded sphere under a known light."""
-    geometry = Renderer(scenes.sphere(), resolution=20).geometry(64)
-    ones, light = np.ones_like(geometry.require("mask")["mask"]), scenes.environment(1)
-
-    def picture(theta: np.ndarray) -> Intrinsics:
-        albedo, roughness = (ones * theta[:3]).astype(np.float32), (ones * theta[3]).astype(np.float32)
-        return geometry.replace(albedo=albedo, roughness=roughness, metallic=0.7 * ones)
-
-    def slope(theta: np.ndarray, step: int) -> np.ndarray:
-        """Of the squared difference of ln(image + 0.05); another seed for the image than for the derivative."""
-        image = shade(picture(theta), light, 36, 2 * step)
-        error = 2 * (np.log(image + 0.05) - np.log(target + 0.05)) / (image + 0.05)
-        found = shade_gradients(picture(theta), error, light, 36, 2 * step + 1, wrt=("albedo", "roughness"))
-        assert found.albedo is not None
-        assert found.roughness is not None
-        return np.array([*found.albedo.sum((0, 1)), found.roughness.sum()])
-
-    true, start = np.array([0.7, 0.4, 0.2, 0.35]), np.array([0.5, 0.5, 0.5, 0.7])
-    target = shade(picture(true), light, 1024, 99)
-    theta, first, second = start, np.zeros(4), np.zeros(4)
-    for step in range(40):
-        found = slope(theta, step)
-        first, second = 0.8 * first + 0.2 * found, 0.9 * second + 0.1 * found**2
-        move = first / (1 - 0.8 ** (step + 1)) / np.sqrt(second / (1 - 0.9 ** (step + 1)))
-        theta = np.clip(theta - 0.05 * 0.96**step * move, 0, 1)
-    assert np.abs(theta - true).max() < 0.02, theta
-    assert np.abs(start - true).max() > 0.3
 
 
 def test_extreme_materials_have_finite_derivatives() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import webdataset
+from inline_executor import Inline
 
 from unirender.errors import UnirenderError
 from unirender.light.environment import environment_directions
@@ -122,7 +123,8 @@ def test_what_misses_the_object_along_its_silhouette_does_not_count() -> None:
 
 def test_a_data_set_of_it_is_read_back(tmp_path: Path) -> None:
     command = Dataset(out=tmp_path / "data", vary="visibility", objects=2, resolution=16, workers=1, turn_objects=True)
-    assert command.run() == 0
+    generate(command.check(), executor=Inline())
+    assert command.run() == 0  # finds all there
     urls = [str(path) for path in sorted((tmp_path / "data").glob("*.tar"))]
     groups = list(webdataset.WebDataset(urls, shardshuffle=False))  # pyright: ignore[reportAttributeAccessIssue] - exported lazily
     assert len(groups) == 2
@@ -134,7 +136,8 @@ def test_a_data_set_of_it_is_read_back(tmp_path: Path) -> None:
         assert len(bits) == pytest.approx(record["coverage"] * 16**2, rel=0.2)
         assert record["vary"] == "visibility"
     first = (tmp_path / "data" / "shard-000000.tar").read_bytes()
-    generate(DatasetConfig(2, 1, 16, "visibility", tmp_path / "again", workers=1, turn_objects=True))
+    again = DatasetConfig(2, 1, 16, "visibility", tmp_path / "again", workers=1, turn_objects=True)
+    generate(again, executor=Inline())
     assert (tmp_path / "again" / "shard-000000.tar").read_bytes() == first
 
 

@@ -241,7 +241,7 @@ def test_the_bare_passes_are_those_of_training(into_renderer: bool, tmp_path: Pa
 
 
 def test_throughput_is_measured_side_by_side(shards: Path) -> None:
-    rows, parallel = throughput(shards, TRAIN, CPU, torch.float32, steps=2, turns=2)
+    rows, parallel = throughput(shards, TRAIN, CPU, torch.float32, steps=1, turns=2)
     assert parallel == torch.get_num_threads()
     assert len(rows) == 2
     for row in rows:

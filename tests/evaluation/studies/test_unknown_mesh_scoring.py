@@ -10,7 +10,7 @@ from unirender.color import srgb_encode
 from unirender_evaluation.multiview.scenes import MultiviewScene
 from unirender_evaluation.multiview.scoring import Looks, ceiling_values, solution_looks, true_looks
 from unirender_evaluation.studies.unknown_mesh.pictures import camera_panels, found_strip
-from unirender_evaluation.studies.unknown_mesh.scoring import score_found, shape_values
+from unirender_evaluation.studies.unknown_mesh.scoring import score_found
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.shapes.mesh_object import RECONSTRUCTION
 
@@ -102,12 +102,6 @@ def test_what_is_covered_beyond_the_truth_counts_in_the_whole_frame(scene: Multi
     assert larger["metallic.mse@masked"] < 1e-12
     assert larger["metallic.mse@whole"] > 1e-3
     assert larger["shape.mask_iou"] < 0.9
-
-
-def test_shape_values_alone_are_those_of_the_score(scene: MultiviewScene, smaller: dict[str, float]) -> None:
-    alone = shape_values(scene, scaled(scene, 0.9).obj)
-    assert len(alone) == 5
-    assert alone.items() <= smaller.items()
 
 
 def test_the_strip_cuts_everything_out_by_its_own_mask(scene: MultiviewScene, smaller_looks: Looks) -> None:

@@ -46,7 +46,7 @@ def modelled(problem, roughness: float, metallic: float) -> np.ndarray:
     return COLOUR * (mixed.u @ cells) + mixed.v @ cells
 
 
-@pytest.mark.parametrize(("roughness", "metallic"), [(0.2, 1.0), (0.35, 0.5), (0.6, 0.0), (1.0, 1.0)])
+@pytest.mark.parametrize(("roughness", "metallic"), [(0.2, 1.0), (0.6, 0.0)])
 def test_matrices_times_light_are_the_direct_image(problem, roughness: float, metallic: float) -> None:
     """Visibility, all lobes, interpolation between nodes; the twin is another material."""
     obj, points, _, light, poses = problem
