@@ -32,7 +32,8 @@ BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check --quiet --no-compile --constraint constraints.txt $(PIP_ARGS)
 REQUIREMENTS := pyproject.toml constraints.txt
 
-.PHONY: all setup lpips-vgg bench bench-full test test-long test-large test-report test-demo test-latex lint docs docs-check format clean
+.PHONY: all setup lpips-vgg bench bench-full test test-long test-large test-report test-demo test-latex
+.PHONY: lint style types tests docs docs-check format clean
 all: bench
 
 # A stamp is newer than what it was installed from, so a second `make` starts at once; both live in .venv and go with it.
@@ -60,15 +61,22 @@ bench: $(VENV)/.runtime lpips-vgg
 bench-full: $(VENV)/.runtime lpips-vgg
 	$(BIN)/unirender bench run --suite $(SUITE) --out $(OUT) --full $(BENCH_ARGS)
 
-lint: $(VENV)/.dev
+lint: style types
+
+style: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
+
+types: $(VENV)/.dev
 	$(BIN)/pyright
 
-# Type checks and documentation use one core each.
-test: $(VENV)/.dev
-	$(MAKE) --jobs=2 --no-print-directory lint docs-check
+# Type checks use one core for minutes; the documentation, and then the tests, have the others.
+test: style
+	$(MAKE) --jobs=2 --no-print-directory types tests
+
+# After the documentation, which imports, and so compiles, much of what each process of pytest does.
+tests: docs-check
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 # The notebooks run in `docs`.
