@@ -37,6 +37,7 @@ VOCABULARY = {
         "pictures",
         "score",
         "system.machine",
+        "system.run_progress",
         "system.whole_files",
         "system.worker_pool",
         "vectors",

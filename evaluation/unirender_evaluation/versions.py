@@ -65,7 +65,6 @@ COMMANDS = (
     "physics/tracer",
     "physics/twins",
     "predictions/check",
-    "run_progress",
     "runs/benchmark",
     "runs/cluster",
     "runs/config",
@@ -86,7 +85,7 @@ COMMANDS = (
 )
 FROM_RECORDS = ("claims", "comparisons", "statistics", "table_list", "verdict")
 # Of the shared vocabulary's folder: the docstrings of its packages, the command line, names of checkpoints, processes.
-OUTSIDE = ("*/__init__", "__main__", "cli", "shipped", "system/worker_pool")
+OUTSIDE = ("*/__init__", "__main__", "cli", "shipped", "system/run_progress", "system/worker_pool")
 # The rooms that records are made in, and of the tables what is asked. Results and the report are made from records.
 ROOMS = ("*.py", "methods/*.py", "physics/*.py", "predictions/*.py", "runs/*.py", "suites/*.py", "truth/*.py")
 QUESTIONS = "tables/specs.py"
