@@ -467,6 +467,7 @@ def test_a_folder_of_frames(ball: Path, tmp_path: Path, capsys: pytest.CaptureFi
     printed = capsys.readouterr()
     assert "4 pictures (0 of them from before), 1 failed" in printed.out
     assert "2 pairs of frames: input 0.0000, albedo 0.0000" in printed.out  # f1, f2, f3: the same noise for all
+    assert "pictures: 0 of 5\n" in printed.err
     assert printed.err.count("f4.png: not a readable picture") == 1
     assert printed.err.count("field of view") == 1
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -775,7 +776,10 @@ def test_train_writes_a_pipeline_that_decompose_loads(
 def test_dataset_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ("--objects", "1", "--pairs", "3", "--resolution", "8", "--spp", "4", "--workers", "1")
     assert run("dataset", *arguments, "--out", tmp_path / "data") == 0
-    assert "3 pairs in 1 groups" in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "3 pairs in 1 groups" in printed.out
+    assert "% of it spent rendering" in printed.out
+    assert "groups: 0 of 1\n" in printed.err, "a log shows that it goes on"
     assert run("dataset", *arguments, "--out", tmp_path / "data") == 0
     assert "complete" in capsys.readouterr().out
 

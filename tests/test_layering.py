@@ -36,6 +36,7 @@ VOCABULARY = {
         "pictures",
         "score",
         "system.machine",
+        "system.run_progress",
         "system.whole_files",
         "system.worker_pool",
         "system.writing",

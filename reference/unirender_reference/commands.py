@@ -168,17 +168,15 @@ class Dataset:
                 "--assets: got it without --recipe, expected a recipe that names folders in it; leave it out"
             )
         from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+        from unirender.system.run_progress import progress_bar
         from unirender_reference.dataset import generate
         from unirender_reference.dataset_config import MOST_SPP
 
         config = self.check()
         if (config.split, config.seed, config.meshes) == ("test", 0, None):
             _log.warning("--split test --seed 0: has the objects of the bundled suites; another --seed has others")
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        console = Console(stderr=True)
-        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        with progress_bar(Console(stderr=True), transient=True) as bar:
             task = bar.add_task("groups", total=None, visible=False)  # until there is something to do
             report = generate(
                 config,
@@ -240,10 +238,10 @@ class Dataset:
             return (
                 f"{self.out}: complete already, {report.skipped_shards} shards; manifest {report.manifest_sha256[:12]}"
             )
-        overhead = f"{report.overhead:.2f} x the bare renders ({report.render_seconds:.1f} s over all workers)"
+        rendered = f"{1 / report.overhead:.0%} of it spent rendering" if report.render_seconds else "nothing rendered"
         return (
             f"{self.out}: {report.samples} pairs in {report.groups} groups, {report.seconds:.1f} s on {report.workers} "
-            f"worker{'s' * (report.workers != 1)}, {overhead if report.render_seconds else 'nothing rendered'}; "
+            f"worker{'s' * (report.workers != 1)}, {rendered}; "
             f"{report.skipped_shards} shards were there; {report.nan_pixels} NaN pixels rendered again; "
             f"manifest {report.manifest_sha256[:12]}"
         )

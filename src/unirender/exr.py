@@ -26,6 +26,7 @@ from unirender.system.whole_files import is_special, replace_file
 Channels = dict[str, Float[np.ndarray, "h w"]]
 COMBINED = re.compile(r"(^|\.)Combined\.R$")  # what a layer of Blender's calls the red of its picture
 
+SIGNATURE = b"\x76\x2f\x31\x01"
 HALF_MAX = 65504.0
 HALF_FULL = 2.0**-10  # half precision has all its digits down to 2^-14: of radiance that ends below, too few are left
 ATTRIBUTE_PREFIX = "unirender:"
@@ -180,10 +181,9 @@ def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[
     except UnirenderError:
         raise
     except Exception as error:  # the binding raises several types for broken data
-        raise UnirenderError(
-            f"{name}: not a readable OpenEXR file, but another, a damaged or a mip-mapped one "
-            f"({str(error).splitlines()[0]}); write it again, as scan lines"
-        ) from error
+        kind = "a damaged or a mip-mapped one" if data.startswith(SIGNATURE) else "another" if data else "empty"
+        message = f"{name}: not a readable OpenEXR file, but {kind}; write it again, as scan lines"
+        raise UnirenderError(message) from error
     if parts != 1:
         raise UnirenderError(f"{name}: got {parts} parts, expected a single-part file; split it first")
     stored, shown = (

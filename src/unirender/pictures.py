@@ -99,7 +99,7 @@ def checked_file(path: str | Path) -> Path:
 
 
 def read_mask(path: str | Path, size: tuple[int, int], *, upright: bool = True) -> Float[np.ndarray, "h w 1"]:
-    """Coverage from a picture file: its alpha channel if it varies, else the mean of its colours, as they are stored.
+    """Coverage from a picture file: its alpha channel unless it is opaque, else the mean of its colours as stored.
 
     An EXR may have `mask.Y` or `Y` instead of colours, or `A` alone. What is lost in reading it is logged. `upright` as
     of `read_picture`.
@@ -161,7 +161,7 @@ def check_mask(mask: Float[np.ndarray, "h w 1"], name: str) -> Float[np.ndarray,
 
 
 def coverage(values: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w 1"]:
-    """What RGB or RGBA values say as a mask: the alpha channel if it varies, else the mean of the colours."""
+    """What RGB or RGBA values say as a mask: the alpha channel unless it is opaque, else the mean of the colours."""
     if values.shape[-1] == 4 and values[..., 3].min() < OPAQUE:
         return values[..., 3:]
     return values[..., :3].mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)

@@ -18,6 +18,7 @@ from optimizer_runs import rendered_views, truth
 
 from unirender import cli
 from unirender.command_line import process_ends
+from unirender.command_line.parse import parse
 from unirender.command_line.process_ends import open_streams
 from unirender.system.ends import Ended, causes, interrupted
 from unirender.system.system_errors import refused_by_system
@@ -38,23 +39,38 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[object, s
     [
         (
             ["optimize", "x", "--out", "y", "--texure-size", "3"],
-            "--texure-size: no option of `unirender optimize`; did you mean --texture-size or --size? "
+            "--texure-size: no option of `unirender optimize`; did you mean --texture-size? "
             "`unirender optimize --help` lists what it takes",
         ),
         (
             ["bench", "race", "--objcts=4", "--zzzzzzzz"],
-            "--objcts, --zzzzzzzz: no option of `unirender bench race`; did you mean --objects or --out? "
+            "--objcts, --zzzzzzzz: no option of `unirender bench race`; did you mean --objects? "
             "`unirender bench race --help` lists what it takes",
         ),
         (  # its help names `unirender bench run --out`
             ["bench", "report", "--out", "x", "y"],  # "missing value for argument 'command.folder'", it was said
-            "--out: no option of `unirender bench report`; did you mean --suite? "
-            "`unirender bench report --help` lists what it takes",
+            "--out: no option of `unirender bench report`; `unirender bench report --help` lists what it takes",
         ),
         (
             ["bench", "--limit", "3", "run"],
             "--limit: no option of `unirender bench`; `unirender bench --help` lists what it takes",
         ),
+        (  # of the same meaning, and no --seed
+            ["dataset", "--out", "x", "--size", "64"],
+            "--size: no option of `unirender dataset`; did you mean --resolution? "
+            "`unirender dataset --help` lists what it takes",
+        ),
+        (
+            ["relight", "x", "--light", "y"],
+            "--light: no option of `unirender relight`; did you mean --environment? "
+            "`unirender relight --help` lists what it takes",
+        ),
+        (["optimise"], "optimise: no command of `unirender`; did you mean optimize? `unirender --help` lists them"),
+        (
+            ["bench", "tabels", "--out", "x"],
+            "tabels: no command of `unirender bench`; did you mean tables? `unirender bench --help` lists them",
+        ),
+        (["bake"], "bake: no command of `unirender`; `unirender --help` lists them"),
         (["doctor", "now"], "now: not expected by `unirender doctor`; `unirender doctor --help` lists what it takes"),
         (["optimize", "x", "--out", "y", "--shape.cells", "0"], "--shape.cells 0: expected 8 or more"),
         (["bench", "unknown-mesh", "--shape.depth", "1"], "--shape.depth 1: expected 2 or more"),
@@ -145,8 +161,35 @@ def test_letters_that_the_output_lacks_are_printed_by_their_number(monkeypatch: 
         monkeypatch.undo()
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "said_of_it"),
+    [
+        ("--metallic", "much", "--metallic: got 'much', expected a number."),  # None where it is not given
+        ("--samples", "1.5", "--samples: got '1.5', expected a whole number."),
+        ("--sampler", "euler", "invalid choice 'euler' for argument '--sampler'. Expected one of ('ddim', 'unipc')."),
+    ],
+)
+def test_a_value_of_another_kind_is_told_without_pythons_words(
+    option: str, value: str, said_of_it: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "120")
+    status, text = said(capsys, "edit", "x.png", "--output", "y", option, value)
+    assert status == 2
+    assert said_of_it in text
+    assert "NoneType" not in text
+    assert "{None}" not in text
+
+
+def test_an_option_may_be_none_where_its_default_is_another(capsys: pytest.CaptureFixture[str]) -> None:
+    passes = parse(cli.Command, ["reference", "passes", "--out", "x", "--roughness", "None"], "unirender", "").command
+    assert (passes.roughness, passes.metallic) == (None, 0.5)
+    with pytest.raises(SystemExit):
+        cli.main(["reference", "passes", "--help"])
+    assert "--roughness FLOAT" in capsys.readouterr().out
+
+
 def test_a_missing_command_or_option_is_told_by_the_parser(capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments, word in ((["bake"], "bake"), (["optimize", "x"], "--out"), (["bench"], "warm-start")):
+    for arguments, word in (([], "doctor"), (["optimize", "x"], "--out"), (["bench"], "warm-start")):
         status, text = said(capsys, *arguments)
         assert status == 2
         assert word in text

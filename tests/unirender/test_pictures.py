@@ -528,6 +528,8 @@ def test_mask_from_luminance_or_alpha(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_mask(tmp_path / "m.png", (1, 2))[..., 0], [[0, 1]])
     Image.fromarray(np.array([[[9, 9, 9, 255], [9, 9, 9, 0]]], dtype=np.uint8)).save(tmp_path / "a.png")
     np.testing.assert_allclose(read_mask(tmp_path / "a.png", (1, 2))[..., 0], [[1, 0]])
+    Image.fromarray(np.array([[[255, 255, 255, 255], [0, 0, 51, 255]]], dtype=np.uint8)).save(tmp_path / "opaque.png")
+    np.testing.assert_allclose(read_mask(tmp_path / "opaque.png", (1, 2))[..., 0], [[1, 17 / 255]], rtol=1e-6)
 
 
 def ramp() -> tuple[np.ndarray, np.ndarray]:

@@ -67,6 +67,18 @@ def test_a_light_that_is_none_is_refused(pipeline: UniRenderPipeline, light: np.
         pipeline.relight(image, light.astype(np.float32), mask)
 
 
+@pytest.mark.parametrize("shape", [(64, 64), (16, 24), (17, 32)])
+def test_a_light_that_is_no_whole_sphere_is_refused(pipeline: UniRenderPipeline, shape: tuple[int, int]) -> None:
+    """A light probe was taken for a lat-long map; the commands refuse its file by the same rule."""
+    image, mask = picture()
+    light = np.ones((*shape, 3), np.float32)
+    words = f"environment: got {shape[1]}x{shape[0]}, expected a lat-long map twice as wide as high; unwrap a light"
+    with pytest.raises(UnirenderError, match=words):
+        pipeline.relight(image, light, mask)
+    with pytest.raises(UnirenderError, match=words):
+        pipeline.render(surface().replace(environment=light))
+
+
 def test_an_unknown_exposure_is_refused(pipeline: UniRenderPipeline) -> None:
     image, mask = picture()
     with pytest.raises(UnirenderError, match="exposure: got 'bright', expected 'auto' or 'keep'"):

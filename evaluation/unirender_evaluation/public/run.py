@@ -20,6 +20,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from unirender.system.run_progress import progress_bar
 from unirender.system.whole_files import replace_file
 from unirender_evaluation import lpips
 from unirender_evaluation.predictions.check import PredictionError, folder_problems
@@ -28,7 +29,6 @@ from unirender_evaluation.public.sets import PublicSet, Sample
 from unirender_evaluation.public.tables import public_tables
 from unirender_evaluation.records import Record, RunInfo, write_csv, write_run
 from unirender_evaluation.rows import Row, evenly
-from unirender_evaluation.run_progress import progress_bar
 from unirender_evaluation.runs.folder import say_missing, say_rows_without_values, write_missing, writing_run
 from unirender_evaluation.store import KEY_PREFIX, Store
 from unirender_evaluation.subsets import partial as partial_limit

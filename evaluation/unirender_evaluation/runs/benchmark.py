@@ -26,6 +26,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
+from unirender.system.run_progress import progress_bar
 from unirender.system.whole_files import replace_file
 from unirender_evaluation import bounds, subsets
 from unirender_evaluation.methods.mitsuba import MITSUBA
@@ -39,7 +40,6 @@ from unirender_evaluation.results.data import NAME as RESULTS
 from unirender_evaluation.results.file import write_results
 from unirender_evaluation.results.lights import sample_lights
 from unirender_evaluation.rows import Row
-from unirender_evaluation.run_progress import progress_bar
 from unirender_evaluation.runs.cluster import run_on_cluster
 from unirender_evaluation.runs.config import BenchConfig, anywhere, build_rows
 from unirender_evaluation.runs.folder import (

@@ -4,8 +4,8 @@ from collections.abc import Iterable
 
 from rich.console import Console
 
+from unirender.system.run_progress import progress_bar
 from unirender_evaluation.records import Record
-from unirender_evaluation.run_progress import progress_bar
 
 
 def collect(

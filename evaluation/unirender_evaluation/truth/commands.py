@@ -91,7 +91,7 @@ class BenchTruth:
         from rich.console import Console
 
         from unirender.system.paths import cache_dir
-        from unirender_evaluation.run_progress import progress_bar
+        from unirender.system.run_progress import progress_bar
         from unirender_evaluation.suites.home import target
         from unirender_evaluation.suites.suite import load_suite
         from unirender_evaluation.truth.make import make_truth, quality_summary

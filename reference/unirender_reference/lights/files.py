@@ -30,7 +30,7 @@ from unirender.blocks import by_rows
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, image_channels, on_pole_grid, pixel_count, read_exr
-from unirender.light.environment import check_shape, resample_environment
+from unirender.light.environment import check_shape, is_whole_sphere, resample_environment
 from unirender.picture_files import display_files
 from unirender.picture_files.primaries import REC709, in_rec709
 from unirender.pictures import check_finite, negative_share
@@ -102,10 +102,10 @@ def load_light(
         environment = photograph_environment(pixels, shape or PHOTOGRAPH_SHAPE)
     else:
         h, w = pixels.shape[:2]
-        if h < 2 or abs(w / h - 2) > 0.02:
+        if not is_whole_sphere(h, w):
             raise UnirenderError(
-                f"light {path}: got {w}x{h}, expected a lat-long map twice as wide as high; an ordinary photograph is "
-                "a PNG or JPG file (in Python also any other, with photograph=True)"
+                f"light {path}: got {w}x{h}, expected a lat-long map twice as wide as high; unwrap a light probe "
+                "first; an ordinary photograph is a PNG or JPG file (in Python also any other, with photograph=True)"
             )
         if on_pole_grid(attributes):
             provenance["rule"] = "lat-long on the contract's grid"

@@ -122,7 +122,8 @@ class NoiseFloor:
     def run(self) -> int:
         """Returns the exit status: 1 where a floor was missed or the estimates are biased."""
         from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        from unirender.system.run_progress import progress_bar
 
         for name in ("images", "factor", "resolution", "limit"):
             if getattr(self, name) < 1:
@@ -131,9 +132,8 @@ class NoiseFloor:
             raise UsageError(f"--floor {self.floor:g}: expected decibels above 0 and below 100")
         if self.workers < 0 or self.seed < 0:
             raise UsageError(f"--workers {self.workers}, --seed {self.seed}: expected 0 or more")
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         rows: list[FloorRow] = []
-        with Progress(*columns, console=Console(stderr=True)) as bar:
+        with progress_bar(Console(stderr=True)) as bar:
             task = bar.add_task("images", total=self.images)
             for row in self._rows():
                 rows.append(row)

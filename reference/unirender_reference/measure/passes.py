@@ -42,9 +42,9 @@ class Passes:
     light: Path | None = None
     """A lat-long EXR or HDR file, or a photograph, in place of the procedural light."""
     roughness: float | None = 0.3
-    """Perceptual, in [0, 1]; None: the object's own map."""
+    """Perceptual, in [0, 1]; the word None: the object's own map."""
     metallic: float | None = 0.5
-    """In [0, 1]; None: the object's own map."""
+    """In [0, 1]; the word None: the object's own map."""
     resolution: int = 96
     """Pixels along each side."""
     spp: int = 1152

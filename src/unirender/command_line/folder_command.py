@@ -104,13 +104,12 @@ def run_folder(command: "Decompose") -> int:
 
 @contextlib.contextmanager
 def progress_of(count: int, shown: bool) -> Iterator[Callable[[int], None]]:
-    """A bar on the terminal, if `shown`, that goes when it is done; gives what is told how many pictures are done."""
+    """A bar, or lines in a log, if `shown`; gives what is told how many pictures are done."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not shown or not console.is_terminal) as bar:
+    from unirender.system.run_progress import progress_bar
+
+    with progress_bar(Console(stderr=True, quiet=not shown), transient=True) as bar:
         task = bar.add_task("pictures", total=count)
         yield lambda done: bar.update(task, completed=done)
 

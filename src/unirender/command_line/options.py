@@ -227,8 +227,8 @@ class InputOptions:
     """PNG, JPG, TIFF, WebP, BMP or EXR (linear, premultiplied), at least 8 pixels along each side. `decompose` takes a
     folder of them, too."""
     mask: Path | None = None
-    """Picture of the object's coverage (white: object), or a folder of such pictures, named like those of a folder.
-    None: the alpha channel, else the whole frame."""
+    """Picture of the object's coverage (white: object; of RGBA the alpha channel, unless it is opaque), or a folder of
+    such pictures, named like those of a folder. None: the picture's alpha channel, else the whole frame."""
 
     @property
     def files(self) -> dict[str, Path | None]:

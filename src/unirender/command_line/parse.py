@@ -5,16 +5,19 @@ import difflib
 import io
 import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import docstring_parser
 import tyro
 
+from unirender.command_line.option_values import registry
 from unirender.errors import UnirenderError, UsageError
 from unirender.system.ends import causes
 
 OPTION = re.compile(r"(?<![\w.-])--[a-z][\w.-]*")
+SYNONYMS = {"size": "resolution", "resolution": "size", "light": "environment", "model": "checkpoint"}
+COMMANDS = re.compile(r"\{([\w,-]+)\}")  # of a usage line
 BORDER = "\N{BOX DRAWINGS LIGHT VERTICAL}"  # of the boxes of a help, where a stream can print it
 LINE_BREAK = re.compile(r"(?<!\n)\n[ ]*(?![ \n]|- )")  # of a sentence: no empty line, no item of a list
 
@@ -56,7 +59,7 @@ def _parsed(commands: Any, words: list[str], prog: str, description: str) -> Any
     try:
         with contextlib.redirect_stderr(io.StringIO()):
             command, unknown = tyro.cli(
-                commands, args=words, prog=prog, description=description, return_unknown_args=True
+                commands, args=words, prog=prog, description=description, registry=registry, return_unknown_args=True
             )
     except SystemExit as stopped:
         for error in causes(stopped):
@@ -64,8 +67,9 @@ def _parsed(commands: Any, words: list[str], prog: str, description: str) -> Any
                 raise error from None
         if not stopped.code:
             raise
-        _check_options(commands, words, prog)
-        command = tyro.cli(commands, args=words, prog=prog, description=description)  # says what is wrong
+        _check_words(commands, words, prog)
+        # says what is wrong
+        command = tyro.cli(commands, args=words, prog=prog, description=description, registry=registry)
         unknown = []
     if unknown:
         raise UsageError(_unknown_words(commands, words, unknown, prog))
@@ -96,41 +100,58 @@ def _sentences_of_options() -> Iterator[None]:
 
 def _unknown_words(commands: Any, words: Sequence[str], unknown: Sequence[str], prog: str) -> str:
     """The sentence on words that no option takes, with the nearest options of that command."""
-    path, known = _asked(commands, words, prog)
+    path, known, _ = _asked(commands, words, prog)
     options = [word.partition("=")[0] for word in unknown if word.startswith("--")]
-    near = dict.fromkeys(match for option in options for match in difflib.get_close_matches(option, known, n=2))
-    meant = f"; did you mean {' or '.join(near)}?" if near else ";"
+    near = dict.fromkeys(f"--{match}" for option in options for match in _near(option[2:], [n[2:] for n in known]))
     wrong = "no option of" if options else "not expected by"
-    return f"{', '.join(options or unknown)}: {wrong} `{path}`{meant} `{path} --help` lists what it takes"
+    return f"{', '.join(options or unknown)}: {wrong} `{path}`{_meant(near)} `{path} --help` lists what it takes"
 
 
-def _check_options(commands: Any, words: Sequence[str], prog: str) -> None:
-    """Looks for options that a command does not have, where something else is wrong, too.
+def _near(word: str, known: Sequence[str]) -> list[str]:
+    """Up to two of the known names that may be meant by a word."""
+    synonym = SYNONYMS.get(word, "")
+    return [synonym] if synonym in known else difflib.get_close_matches(word, known, n=2)
 
-    What follows one is taken for a value of the command then, and what is said of that is no help.
+
+def _meant(near: Iterable[str]) -> str:
+    """What ends a sentence on something unknown, before what lists all that is known."""
+    return f"; did you mean {' or '.join(near)}?" if near else ";"
+
+
+def _check_words(commands: Any, words: Sequence[str], prog: str) -> None:
+    """Looks for a command that is not there, and for options that a command does not have, where something is wrong.
+
+    What follows such an option is taken for a value of the command then, and what is said of that is no help.
 
     Raises:
         UsageError: there are some.
     """
-    path, known = _asked(commands, words, prog)
+    path, known, names = _asked(commands, words, prog)
+    after = words[path.count(" ") :]
+    if names and after and not after[0].startswith("-"):
+        near = _near(after[0], names)
+        raise UsageError(f"{after[0]}: no command of `{path}`{_meant(near)} `{path} --help` lists them")
     used = [word.partition("=")[0] for word in words if word.startswith("--")]
     unknown = [option for option in used if option.replace("_", "-") not in known]
     if unknown and path != prog:
         raise UsageError(_unknown_words(commands, words, unknown, prog))
 
 
-def _asked(commands: Any, words: Sequence[str], prog: str) -> tuple[str, list[str]]:
-    """The command that a line begins with, from the program's name on, and the options that its help lists."""
+def _asked(commands: Any, words: Sequence[str], prog: str) -> tuple[str, list[str], list[str]]:
+    """The command that a line begins with, from the program's name on, the options that its help lists, and the
+    commands that it has itself."""
     names = list(itertools.takewhile(lambda word: not word.startswith("-"), words))[:2]  # or values of a command
     while True:
         printed, path = io.TextIOWrapper(io.BytesIO(), encoding="utf-8"), " ".join([prog, *names])
         streams = contextlib.redirect_stdout(printed), contextlib.redirect_stderr(io.StringIO())
         with streams[0], streams[1], contextlib.suppress(SystemExit):
-            tyro.cli(commands, args=[*names, "--help"], prog=prog)
+            tyro.cli(commands, args=[*names, "--help"], prog=prog, registry=registry)
         printed.seek(0)
         lines = printed.read().splitlines()
-        if not names or any(line.startswith(f"usage: {path} ") for line in lines):
+        usage = next((line for line in lines if line.startswith(f"usage: {path} ")), "")
+        if usage or not names:
             cells = (cell for line in lines for cell in line.split(BORDER))  # several a line, where a terminal is wide
             heads = [cell[1:].split("  ")[0] for cell in cells if cell[1:2] == "-"]  # not the prose
-            return path, sorted({"--help", *OPTION.findall(" ".join(heads))})
+            below = [name for listed in COMMANDS.findall(usage) for name in listed.split(",")]
+            return path, sorted({"--help", *OPTION.findall(" ".join(heads))}), below
         names.pop()

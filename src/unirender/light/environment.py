@@ -26,6 +26,7 @@ from unirender.intrinsics import as_radiance, check_radiance
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
+ASPECT_TOLERANCE = 0.02  # of the width over the height, which is 2
 POLE_STEP = 1e-16  # from a pole, so small that it turns no other direction
 LEAST_ROWS, LEAST_COLUMNS = 3, 2  # of a light to render by: Mitsuba resamples smaller ones
 UNIT_TOLERANCE = 0.05  # of squared lengths: 0.7 for half of the root of 2 is near enough
@@ -50,6 +51,11 @@ def as_light(environment: Any) -> Float[np.ndarray, "h w 3"]:
     if not np.isfinite(light).all() or light.min() < 0:
         raise UnirenderError("environment: got NaN, infinite or negative radiance, expected finite values >= 0")
     return light
+
+
+def is_whole_sphere(height: int, width: int) -> bool:
+    """Whether a map of that size is a lat-long map by its shape: twice as wide as high."""
+    return height >= 2 and abs(width / height - 2) <= ASPECT_TOLERANCE
 
 
 def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:

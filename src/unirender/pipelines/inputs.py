@@ -12,7 +12,7 @@ from PIL import Image
 from unirender.arguments import as_instance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import RANGE_TOLERANCE, Intrinsics, as_numbers
-from unirender.light.environment import as_light
+from unirender.light.environment import as_light, is_whole_sphere
 from unirender.picture_files.display_files import display_colors, display_values, is_turned
 from unirender.pictures import coverage
 from unirender.pipelines.bounced_light import WHITE_SKY, bounced_light
@@ -90,7 +90,7 @@ def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"]
 
 
 def as_mask(mask: Any, size: tuple[int, int]) -> Float[np.ndarray, "h w 1"]:
-    """Coverage of the given size; of a PIL picture its alpha channel if it varies, else the mean of its colours.
+    """Coverage of the given size; of a PIL picture its alpha channel unless it is opaque, else the mean of its colours.
 
     Raises:
         UnirenderError: wrong type, shape or range, NaN, or nothing covered by more than one half.
@@ -114,7 +114,8 @@ def as_environment(environment: Any) -> Float[np.ndarray, "eh ew 3"]:
     """Radiance of a lat-long map.
 
     Raises:
-        UnirenderError: as `unirender.light.environment.as_light`; or it is the path of a file, or black.
+        UnirenderError: as `unirender.light.environment.as_light`; or it is the path of a file, black, or not twice as
+            wide as high.
     """
     if isinstance(environment, str | Path):
         raise UnirenderError(
@@ -122,9 +123,24 @@ def as_environment(environment: Any) -> Float[np.ndarray, "eh ew 3"]:
             "unirender_reference.lights.load_light(path).environment"
         )
     light = as_light(environment)
+    check_sphere(light)
     if light.max() <= 0:
         raise UnirenderError("environment: the light is black, expected some radiance")
     return light
+
+
+def check_sphere(environment: Float[np.ndarray, "*n eh ew 3"]) -> None:
+    """Looks at the shape of a light.
+
+    Raises:
+        UnirenderError: it is not twice as wide as high, as a light probe or a photograph.
+    """
+    height, width = environment.shape[-3:-1]
+    if not is_whole_sphere(height, width):
+        raise UnirenderError(
+            f"environment: got {width}x{height}, expected a lat-long map twice as wide as high; unwrap a light probe "
+            "first; of a photograph's file unirender_reference.lights.load_light(path, photograph=True) makes one"
+        )
 
 
 def to_derive(intrinsics: Intrinsics) -> frozenset[str]:
@@ -184,9 +200,12 @@ def check_rendered(intrinsics: Any, derived: Collection[str]) -> None:
     """Looks at what is to be rendered, and at the names of what was derived from its light.
 
     Raises:
-        UnirenderError: no intrinsics, or a name of no map that can be derived.
+        UnirenderError: no intrinsics, a light that is not twice as wide as high, or a name of no map that can be
+            derived.
     """
     as_instance(intrinsics, Intrinsics, "render")
+    if intrinsics.environment is not None:
+        check_sphere(intrinsics.environment)
     if unknown := sorted(set(derived) - set(DERIVABLE)):
         raise UnirenderError(f"derived: got {', '.join(unknown)}, expected names out of {', '.join(DERIVABLE)}")
 

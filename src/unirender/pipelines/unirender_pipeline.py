@@ -362,7 +362,8 @@ class UniRenderPipeline(DualStreamPipeline):
 
         Args:
             image_srgb: as for `decompose`.
-            environment: lat-long radiance [eh ew 3] in camera axes, any size; None where both s and d are given.
+            environment: lat-long radiance [eh ew 3] in camera axes, twice as wide as high; None where both s and
+                d are given.
             mask: as for `decompose`.
             exposure: `auto` scales the light so that white under it is as bright as in the training data; `keep` not.
             anchored: as for `edit`.

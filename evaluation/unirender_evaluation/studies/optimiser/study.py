@@ -9,9 +9,9 @@ from typing import Any
 
 from rich.console import Console
 
+from unirender.system.run_progress import progress_bar
 from unirender_evaluation.multiview.scenes import MultiviewScene, multiview_scenes, suite_scene
 from unirender_evaluation.multiview.settings import STANDARD, MultiviewSettings
-from unirender_evaluation.run_progress import progress_bar
 from unirender_evaluation.store import content_key
 from unirender_evaluation.suites.suite import Scene, Suite, load_suite
 from unirender_evaluation.versions import (

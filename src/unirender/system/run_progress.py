@@ -12,7 +12,7 @@ SURE = 0.05  # of a task: before, its pace says nothing yet
 
 class LineProgress(Progress):
     """A `rich.progress.Progress` that draws nothing and prints lines: one when the count of a task is known, then one
-    as it advances, at most every `EVERY` seconds, with the time that the rest takes at the pace so far.
+    as it advances, at most every `EVERY` seconds, with the time that the rest takes at the pace since the first.
 
     Args:
         console: to print them on.
@@ -21,6 +21,7 @@ class LineProgress(Progress):
     def __init__(self, console: Console) -> None:
         super().__init__(console=console, disable=True)
         self._said: dict[TaskID, float] = {}
+        self._first: dict[TaskID, tuple[float, float]] = {}  # when the count was known, and what was done by then
         self._turn = threading.Lock()
 
     def add_task(self, description: str, *args: Any, **kwargs: Any) -> TaskID:
@@ -47,16 +48,18 @@ class LineProgress(Progress):
             if not (task.total and task.visible) or task.finished or (before is not None and now - before < EVERY):
                 return
             self._said[task_id] = now
-        self.console.print(progress_line(task), highlight=False, markup=False, soft_wrap=True)
+            start, kept = self._first.setdefault(task_id, (now, task.completed))
+        self.console.print(progress_line(task, kept, now - start), highlight=False, markup=False, soft_wrap=True)
 
 
-def progress_line(task: Task) -> str:
-    """What is at work, how much of it is done, and how long the rest takes if it goes on as so far."""
-    done, total = int(task.completed), int(task.total or 0)
-    line = f"{task.description}: {done} of {total}"
-    if done < SURE * total or not done or task.elapsed is None:
+def progress_line(task: Task, kept: float, seconds: float) -> str:
+    """What is at work, how much of it is done, and how long the rest takes if it goes on as in these seconds, before
+    which `kept` was done."""
+    total = task.total or 0
+    line, done = f"{task.description}: {task.completed:.0f} of {total:.0f}", task.completed - kept
+    if done < SURE * (total - kept) or not done:
         return line
-    return f"{line}, {_duration(task.elapsed / done * (total - done))} left at this pace"
+    return f"{line}, {_duration(seconds / done * (total - task.completed))} left at this pace"
 
 
 def _duration(seconds: float) -> str:
@@ -65,9 +68,11 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 99.5 * 60 else f"{seconds / 3600:.1f} h"
 
 
-def progress_bar(console: Console) -> Progress:
-    """A bar with what is at work, how many are done and the time that remains; lines where `console` is no terminal."""
+def progress_bar(console: Console, *, transient: bool = False) -> Progress:
+    """A bar with what is at work, how many are done and the time that remains; lines where `console` is no terminal.
+
+    `transient`: the bar goes when it is done."""
     if not console.is_terminal:
         return LineProgress(Console(stderr=True, quiet=console.quiet))
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=console)
+    return Progress(*columns, console=console, transient=transient)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 from rich.console import Console
 
-from unirender_evaluation.run_progress import EVERY, LineProgress, progress_bar
+from unirender.system.run_progress import EVERY, LineProgress, progress_bar
 
 
 @pytest.fixture
@@ -71,6 +71,18 @@ def test_the_first_of_many_says_nothing_of_the_rest(printed: tuple[LineProgress,
     clock[0] += 22
     progress.advance(bar)
     assert out.getvalue().splitlines()[-1] == "methods: 1 of 174"
+
+
+def test_what_an_earlier_run_had_done_does_not_count_for_the_pace(
+    printed: tuple[LineProgress, io.StringIO, list[float]],
+) -> None:
+    """A data set of 1,000 groups that was stopped at the 900th: "4 s left", it said."""
+    progress, out, clock = printed
+    bar = progress.add_task("groups", total=None)
+    progress.update(bar, completed=900, total=1000)
+    clock[0] += 40
+    progress.update(bar, completed=910)
+    assert out.getvalue().splitlines() == ["groups: 900 of 1000", "groups: 910 of 1000, 6 min left at this pace"]
 
 
 def test_a_terminal_gets_a_bar_and_a_log_lines_on_the_other_stream(capsys: pytest.CaptureFixture[str]) -> None:
