@@ -13,9 +13,11 @@ from unirender.color import image_srgb, srgb_decode, unpremultiply
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import MAPS, Intrinsics
 from unirender.light.environment import resample_environment
+from unirender.system import machine
 from unirender_reference.optimize.single.config import (
     COLD,
     COLD_MESH,
+    MATRIX_BYTES,
     WARM_NORMALS,
     Priors,
     SingleConfig,
@@ -258,8 +260,21 @@ def test_what_cannot_be_used_is_refused(picture: np.ndarray, truth: Intrinsics, 
     for options, reason in wrong:
         with pytest.raises(UsageError, match=reason):
             SingleConfig(**options)
-    with pytest.raises(UnirenderError, match=r"--single\.light-rows 100000: would take about"):
-        SingleConfig(light_rows=100_000)
+
+
+def test_a_light_that_the_memory_does_not_hold_is_refused(
+    picture: np.ndarray, truth: Intrinsics, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the pixels of the last stage, which are more than those of the search, or by all that are covered."""
+    mask = truth.require("mask")["mask"]
+    covered = int((mask > 0).sum())
+    for pixels, taken in ((covered // 2, covered // 2), (10 * covered, covered)):
+        config = replace(QUICK, light_rows=64, coarse_pixels=16, pixels=pixels)
+        monkeypatch.setattr(machine, "memory_bytes", lambda taken=taken: MATRIX_BYTES * taken * 2 * 64**2 - 1)
+        with pytest.raises(UnirenderError, match=r"--single\.light-rows 64: would take about"):
+            optimize_image(picture, mask, CAMERA, config)
+        monkeypatch.setattr(machine, "memory_bytes", lambda taken=taken: MATRIX_BYTES * taken * 2 * 64**2)
+        config.require_memory(covered)  # the twin
 
 
 def test_what_a_result_has_of_its_start_is_named() -> None:

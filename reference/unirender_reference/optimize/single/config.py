@@ -132,7 +132,17 @@ class SingleConfig:
                 f"--single.steps {_words(self.steps)}, --single.noise {_words(self.noise)}: expected as many numbers "
                 "in both, a pair for each stage"
             )
-        entries = min(self.pixels, self.coarse_pixels) * 2.0 * self.light_rows**2
+
+    def require_memory(self, covered: int) -> None:
+        """Looks at what the last stage takes.
+
+        Args:
+            covered: pixels of the picture.
+
+        Raises:
+            UnirenderError: it is more than the machine has in all.
+        """
+        entries = min(self.pixels, covered) * 2.0 * self.light_rows**2
         require_memory({f"--single.light-rows {self.light_rows}": MATRIX_BYTES * entries})
 
     def resolved(self, known_mesh: bool, warm: bool) -> tuple[Priors, Trust]:

@@ -66,12 +66,13 @@ def optimize_image(
 
     Raises:
         UnirenderError: sizes differ, the mask is empty, values are out of range, `init` lacks a map, or the mesh does
-            not lie under the mask.
+            not lie under the mask; or the light takes more memory than the machine has.
     """
     as_instance(config, SingleConfig, "optimize: config")
     as_instance(camera, Camera, "optimize: camera")
     image, mask = as_floats(image, "image"), as_coverage(mask, "mask")
     linear = _checked(image, mask, hdr)
+    config.require_memory(int((mask > 0).sum()))
     if geometry is not None:
         check_in_picture(mask, camera, geometry)
     exposure = exposure_of(linear, mask) if hdr else 1.0
