@@ -7,7 +7,15 @@ from dataclasses import dataclass, replace
 
 from unirender_evaluation.ceiling import ceiling_lines
 from unirender_evaluation.claims import OUR_CLAIMS, Claim, run_claims
-from unirender_evaluation.comparisons import Comparison, Lights, Selection, compare, difference_over_lights, values_of
+from unirender_evaluation.comparisons import (
+    Comparison,
+    Lights,
+    Selection,
+    compare,
+    difference_over_lights,
+    values_of,
+    without_rounding,
+)
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.statistics import Estimate, holm, light_count, paired_p_value
 from unirender_evaluation.task import LIGHT
@@ -118,7 +126,7 @@ def findings(
             comparison = compare(chosen, claim.kind, key, claim.a, claim.b)
             claimed = claim.expected == "beats"
             asked = len({record.sample for record in whole if key in record.values})
-            p = paired_p_value(a, b, {record.sample: record.object for record in chosen})
+            p = paired_p_value(a, without_rounding(a, b), {record.sample: record.object for record in chosen})
             finding = Finding(claim, comparison, comparison.a_beats_b if claimed else None, asked=asked, p_value=p)
             if lights:
                 other = difference_over_lights(chosen, key, claim.a, claim.b, lights)

@@ -352,3 +352,13 @@ def test_one_object_decides_nothing() -> None:
     )
     assert text.endswith("1 object)")
     assert "nan" not in text
+
+
+def test_a_difference_by_rounding_is_no_certain_claim_of_holms() -> None:
+    """It made the limit of the claims after it easier to meet."""
+    level = np.linspace(15, 20, 12)
+    records = [*rows("a", ALBEDO, level * (1 + 1e-9)), *rows("b", ALBEDO, level)]
+    (found,) = findings(records, [Claim("inverse", "single-image", "albedo", "psnr", "a", "b")])
+    assert (found.p_value, found.holds) == (1, False)
+    assert found.comparison is not None
+    assert found.comparison.equal

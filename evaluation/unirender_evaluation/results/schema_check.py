@@ -101,10 +101,7 @@ class Rule:
             return False
         if "const" in self.schema and (value != self.schema["const"] or "boolean" in kinds):
             return False
-        for rule in self._alternatives:
-            if rule.allows(value):
-                return True
-        return not self._alternatives
+        return not self._alternatives or any(rule.allows(value) for rule in self._alternatives)
 
     @functools.cached_property
     def properties(self) -> "dict[str, Rule]":
