@@ -409,16 +409,6 @@ def test_settings_are_recorded(ball: Path, decomposed: Path, tmp_path: Path) -> 
         assert Image.open(tmp_path / folder / "albedo.png").size == (150, 100)
 
 
-def test_looks_that_there_are_not_are_refused(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments, message in (
-        (("--looks", "13"), "looks: got 13"),
-        (("--looks", "2", "--samples", "2"), "mode sample"),
-    ):
-        assert run("decompose", ball, *arguments, "--output", tmp_path / "none") == 2
-        assert message in capsys.readouterr().err
-        assert not (tmp_path / "none").exists()
-
-
 def test_the_mask_file_is_recorded_and_where_it_lies_is_no_setting(ball: Path, tmp_path: Path) -> None:
     (tmp_path / "in").mkdir()
     Image.open(ball).convert("RGB").save(tmp_path / "in" / "ball.png")
@@ -600,6 +590,8 @@ USAGE = {
     "seed": (["render", "FOLDER", "--output", "OUT", "--seed", "99999999999999999999"], "64 bits"),
     "sampler of one step": (["decompose", "PICTURE", "--output", "OUT", "--sampler", "unipc"], "one step needs none"),
     "size": (["decompose", "PICTURE", "--output", "OUT", "--size", "100"], "expected a multiple of 32, like 64"),
+    "looks": (["decompose", "PICTURE", "--output", "OUT", "--looks", "13"], "looks: got 13"),
+    "looks of samples": (["decompose", "PICTURE", "--output", "OUT", "--looks", "2", "--samples", "2"], "mode sample"),
     "device": (["decompose", "PICTURE", "--output", "OUT", "--device", "tpu"], "tpu"),
     "exposure": (["relight", "PICTURE", "--environment", "L", "--output", "OUT", "--exposure", "99"], "stops"),
     "exposure of nothing": (["render", "FOLDER", "--output", "OUT", "--exposure", "1"], "--environment"),
@@ -728,7 +720,7 @@ def test_train_writes_a_pipeline_that_decompose_loads(
     (tmp_path / "empty").mkdir()
     assert run("train", "--data", tmp_path / "empty", "--out", tmp_path / "run") == 1
     assert not (tmp_path / "run").exists()
-    write_dataset(tmp_path / "data", vary="basis", size=64)
+    write_dataset(tmp_path / "data", size=64, shards=1)
     length = ("--steps", "1", "--batch-size", "2")
     scored = ("--validate", "1", "--keep-best", "albedo.psnr")
     assert run("train", "--data", tmp_path / "data", "--out", tmp_path / "run", *length, *scored) == 0
