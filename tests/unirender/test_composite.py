@@ -88,8 +88,8 @@ def test_the_tables_that_ship_are_what_the_code_integrates(regenerate: bool) -> 
     assert np.abs(integrated.astype(np.float32) - integrated).max() > 1e-9  # single precision would not do
 
 
-@pytest.mark.parametrize("n_v", [0.1, 0.3, 0.62, 0.95])
-@pytest.mark.parametrize("roughness", [0.35, 0.5, 0.77, 1.0])
+@pytest.mark.parametrize("n_v", [0.1, 0.62])
+@pytest.mark.parametrize("roughness", [0.35, 0.77, 1.0])
 def test_environment_brdf_is_the_integral_of_the_lobe(n_v: float, roughness: float) -> None:
     """Within 0.004, the table's resolution; with alpha = roughness (not its square) it is not."""
     found = [float(x) for x in environment_brdf(np.array(n_v), np.array(roughness))]

@@ -106,6 +106,7 @@ def test_it_is_derived_once(folder: Path, dataset: GroupDataset) -> None:
 
 def test_roughness_maps_have_their_own_lobes(tmp_path: Path) -> None:
     write_shard(tmp_path / "shard-000000.tar", {"a": maps_members(16, lights=2, seed=0)})
+    derived._derive(tmp_path / "shard-000000.tar", GroupDataset(tmp_path).shards[0])  # in this process: none to start
     data = GroupDataset(tmp_path, derived=True)
     sample = data.sample(0, 0, Augmentation(**{**vars(NO_AUGMENTATION), "derived": 1.0}))
     _, entry = data._groups[0]

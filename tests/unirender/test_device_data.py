@@ -15,8 +15,10 @@ from unirender.training.augmentations.augment import NO_AUGMENTATION
 from unirender.training.command import Train
 from unirender.training.config import Augmentation, RunConfig
 from unirender.training.data.dataset import ALL_ROWS, Batch, GroupDataset, make_batch
+from unirender.training.data.derived import _derive
 from unirender.training.data.device_data import DeviceSource, fits, packed_bytes, room
 from unirender.training.data.device_groups import DeviceGroups
+from unirender.training.data.groups import list_shards
 from unirender.training.data.source import ShardSource
 from unirender.training.loop.facts import training_facts
 from unirender.training.loop.trainer import Trainer
@@ -51,6 +53,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_shard(folder / "shard-000000.tar", basis)
     write_shard(folder / "shard-000001.tar", {"p": group_members("independent", 16, 2, (30,), (70,), seed=9)})
     write_shard(folder / "shard-000002.tar", {"m": maps_members(16, 2, 5)})
+    for path, shard in zip(list_shards(folder), GroupDataset(folder).shards, strict=True):
+        _derive(path, shard)  # in this process: none to start
     return folder
 
 

@@ -1,15 +1,12 @@
 """Schedule, timesteps and samplers, against closed forms."""
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
-from diffusers.schedulers.scheduling_unipc_multistep import UniPCMultistepScheduler
-from torch import Tensor
 
-from unirender.diffusion.sampling import MOST_STEPS, denoise, draw_noise, make_sampler, set_timesteps, steps_of
+from unirender.diffusion.sampling import MOST_STEPS, draw_noise, make_sampler, set_timesteps, steps_of
 from unirender.diffusion.schedule import add_noise, last_timestep, make_scheduler, zero_terminal_betas
 from unirender.diffusion.timesteps import algorithm1_timesteps, conditional_timesteps, draw_timesteps
 from unirender.errors import UnirenderError
@@ -154,48 +151,7 @@ def test_unknown_rule() -> None:
         draw_timesteps("both", 4, 999, 0.5, 0.5, torch.Generator())
 
 
-# --- sampling: x0 ~ N(mu, s^2), whose denoiser E[x0 | x_t] is known exactly
-
-MU, S = 0.7, 0.5
-
-
-def exact_denoiser(x_t: Tensor, t: Tensor) -> Tensor:
-    alpha_bar = make_scheduler().alphas_cumprod[t][:, None, None, None]
-    a, sigma_2 = alpha_bar.sqrt(), 1 - alpha_bar
-    return MU + a * S**2 / (a**2 * S**2 + sigma_2) * (x_t - a * MU)
-
-
-def test_one_step_is_the_mean() -> None:
-    x = denoise(exact_denoiser, torch.randn(4, 1, 8, 8), make_scheduler(), 1)
-    torch.testing.assert_close(x, torch.full_like(x, MU))
-
-
-def ddim_error(steps: int) -> float:
-    """Largest error of the probability flow's end point: x0 = mu + s * noise, exactly."""
-    noise = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
-    return float((denoise(exact_denoiser, noise, make_scheduler(), steps) - (MU + S * noise)).abs().max())
-
-
-def test_ddim_samples_the_gaussian_with_first_order_error() -> None:
-    errors = [ddim_error(n) for n in (10, 20, 40)]
-    orders = [math.log2(a / b) for a, b in pairwise(errors)]
-    assert all(0.6 < order < 1.6 for order in orders), f"orders {orders}, errors {errors}"
-    assert errors[-1] < 0.1
-
-
-def test_other_schedulers_work() -> None:
-    scheduler = UniPCMultistepScheduler.from_config(make_scheduler().config, final_sigmas_type="zero")
-    noise = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)
-    x = denoise(exact_denoiser, noise, scheduler, 20)
-    assert torch.isfinite(x).all()
-    assert float((x - (MU + S * noise)).abs().max()) < 0.3
-
-
-def test_noise_of_a_row_does_not_depend_on_the_batch() -> None:
-    like = torch.zeros(1)
-    one = draw_noise((1, 3, 4, 4), like, torch.Generator().manual_seed(5))
-    many = draw_noise((6, 3, 4, 4), like, torch.Generator().manual_seed(5))
-    assert torch.equal(one[0], many[0])
+# --- sampling
 
 
 def test_noise_of_a_seed_does_not_depend_on_the_default_dtype() -> None:

@@ -111,7 +111,7 @@ def test_what_is_left_out_is_no_part_of_the_object() -> None:
     stray[0, 0] = 1
     picture = np.full((128, 128, 3), 0.5, np.float32)
     pipeline = make_pipeline()
-    ways: list[dict[str, Any]] = [{}, {"tile": True, "size": 32}, {"material": "map"}]
+    ways: list[dict[str, Any]] = [{}, {"tile": True, "size": 32, "closed": False}, {"material": "map", "closed": False}]
     for settings in ways:
         clean = pipeline.decompose(picture, mask, **settings)
         for given, tolerance in ((stray, 1e-5), (haze, 0.2)):  # haze in the square adds some background to what is seen

@@ -107,7 +107,7 @@ def test_mirror_flips_x() -> None:
     )
 
 
-@pytest.mark.parametrize("shape", [(20, 40), (22, 44), (24, 48), (28, 56), (31, 62), (12, 24), (13, 26)])
+@pytest.mark.parametrize("shape", [(20, 40), (31, 62), (13, 26)])
 def test_growing_keeps_the_energy_of_a_lamp_wherever_it_stands(shape: tuple[int, int]) -> None:
     """Grids that do not lie on one another: samples of a lamp would say up to 13 % more or less than it has."""
     for row, column in ((1, 5), (shape[0] // 3, 3), (shape[0] // 3 + 1, 4), (shape[0] // 2, 7)):

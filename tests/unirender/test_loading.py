@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -26,10 +27,16 @@ WEIGHTS = "dual_stream/diffusion_pytorch_model.safetensors"
 CONFIG = "dual_stream/config.json"
 
 
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("saved")
+    make_pipeline().save_pretrained(folder)
+    return folder
+
+
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    make_pipeline().save_pretrained(tmp_path / "mine")
-    return tmp_path / "mine"
+def folder(saved: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(saved, tmp_path / "mine")
 
 
 def halve(path: Path) -> None:

@@ -1,5 +1,6 @@
 """The factor of a loss in float16: its rule is that of PyTorch, and a step that overflowed leaves no trace."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,14 @@ from unirender.training.optim import loss_scale
 from unirender.training.optim.loss_scale import FIRST, LEAST, LossScale
 
 CPU = torch.device("cpu")
+CONFIG = dataclasses.replace(TRAIN, batch_size=2)  # a row for each direction: on a CPU float16 takes long
 
 
 class Steady:
     """A source of one batch."""
 
     def next(self) -> dict[str, Tensor]:
-        return make_batch(TRAIN.batch_size)
+        return make_batch(CONFIG.batch_size)
 
     def read_ahead(self) -> None:
         pass
@@ -63,7 +65,7 @@ def test_without_float16_it_is_one_for_ever() -> None:
 
 
 def test_a_step_that_overflowed_is_left_out_and_the_run_goes_on(tmp_path: Path) -> None:
-    trainer = Trainer(TRAIN, RunConfig(tmp_path, steps=2, log_every=1), CPU, torch.float16)
+    trainer = Trainer(CONFIG, RunConfig(tmp_path, steps=2, log_every=1), CPU, torch.float16)
     trainer.loss_scale.value = 2.0**60
     before = [p.detach().clone() for p in trainer.model.parameters()]
     trainer.fit(Steady(), lambda line: None)
@@ -75,7 +77,7 @@ def test_a_step_that_overflowed_is_left_out_and_the_run_goes_on(tmp_path: Path) 
     state = load_state(tmp_path)
     assert state is not None
     assert state["loss_scale"] == {"value": 2.0**58, "finite": 0}
-    more = Trainer(TRAIN, RunConfig(tmp_path, steps=3), CPU, torch.float16)
+    more = Trainer(CONFIG, RunConfig(tmp_path, steps=3), CPU, torch.float16)
     more.resume(Steady())
     assert more.loss_scale.value == 2.0**58
     more.loss_scale.value = FIRST
@@ -84,9 +86,9 @@ def test_a_step_that_overflowed_is_left_out_and_the_run_goes_on(tmp_path: Path) 
 
 
 def test_an_overflow_that_no_factor_made_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trainer = Trainer(TRAIN, RunConfig(tmp_path, steps=2), CPU, torch.float16)
+    trainer = Trainer(CONFIG, RunConfig(tmp_path, steps=2), CPU, torch.float16)
     monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", lambda weights, norm: torch.tensor(float("nan")))
     trainer.loss_scale.value = 2 * LEAST
-    trainer.train_step(make_batch())
+    trainer.train_step(Steady().next())
     with pytest.raises(UnirenderError, match="the gradient at step 1 is nan; lower the learning rate"):
-        trainer.train_step(make_batch())
+        trainer.train_step(Steady().next())

@@ -23,7 +23,7 @@ from unirender.training.losses.loss_function import DROPPABLE
 GROWN = ("albedo", "normal", "roughness", "metallic", "mask")
 SUBSETS = [
     (prior, known)
-    for prior, counts in (("none", (0, 1)), ("split_sum", (0, 1, 3)))
+    for prior, counts in (("none", (1,)), ("split_sum", (0, 1)))
     for count in counts
     for known in itertools.combinations(DROPPABLE, count)
 ]

@@ -4,8 +4,8 @@ import functools
 import io
 import json
 import re
+import resource
 import shutil
-import subprocess
 import sys
 import tarfile
 from collections.abc import Callable
@@ -278,12 +278,16 @@ def test_a_damaged_cache_is_named(tmp_path: Path, end: str, monkeypatch: pytest.
 def test_a_full_disk_has_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "cache"))
     write_shard(tmp_path / "shard-000000.tar", {"a": members()})
-    script = "import sys; from unirender.training.data.dataset import GroupDataset; GroupDataset(sys.argv[1])"
-    # Kilobytes of a file; without -B Python cuts its bytecode off as well, and nothing imports the modules again.
-    limited = f"ulimit -f 1; exec {sys.executable} -B -c '{script}' {tmp_path}"
-    ended = subprocess.run(["bash", "-c", limited], capture_output=True, text=True, check=False)
-    assert re.search(r"cannot be written \(\w.*\); free some space or set UNIRENDER_CACHE", ended.stderr)
-    assert "(None)" not in ended.stderr
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # or it is cut off as well, and nothing imports it again
+    before, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, most))
+    try:
+        with pytest.raises(UnirenderError) as caught:
+            GroupDataset(tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (before, most))
+    assert re.search(r"cannot be written \(\w.*\); free some space or set UNIRENDER_CACHE", str(caught.value))
+    assert "(None)" not in str(caught.value)
 
 
 @pytest.mark.parametrize("end", ["group", "member"])

@@ -275,13 +275,6 @@ def test_a_mask_outside_of_0_to_1_is_told_or_refused(tmp_path: Path) -> None:
             read_input(tmp_path / "a.png", tmp_path / "m.exr")
 
 
-def test_exif_orientation_is_applied(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = 6  # a quarter turn
-    Image.new("RGB", (8, 4)).save(tmp_path / "a.jpg", exif=exif)
-    assert read_picture(tmp_path / "a.jpg").image_srgb.shape == (8, 4, 3)
-
-
 def test_exr_is_unpremultiplied_and_encoded(tmp_path: Path) -> None:
     alpha = np.array([[1.0, 0.5, 0.0]], dtype=np.float32)
     rgb = np.array([[0.2, 0.2, 0.2]], dtype=np.float32) * alpha

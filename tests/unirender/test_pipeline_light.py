@@ -47,7 +47,7 @@ def slice_of(given: Intrinsics) -> Intrinsics:
     """The middle rows of the ball, so that a test of every pixel is quick."""
     mask = given.require("mask")["mask"].copy()
     middle = given.height // 2
-    mask[: middle - 20] = mask[middle + 20 :] = 0
+    mask[: middle - 8] = mask[middle + 8 :] = 0
     return given.replace(**{name: value * mask for name, value in given.maps.items()})
 
 
@@ -63,7 +63,7 @@ def interior(given: Intrinsics) -> np.ndarray:
     return given.require("normal")["normal"][..., 2] > 0.3
 
 
-@pytest.mark.parametrize("size", [(120, LIGHT_SIDE), (LIGHT_SIDE, 80), (64, 64)])
+@pytest.mark.parametrize("size", [(120, LIGHT_SIDE), (LIGHT_SIDE, 80)])
 def test_small_pictures_have_the_light_of_every_pixel(size: tuple[int, int]) -> None:
     given, environment = surface(*size), light(16)
     s, d = every_pixel(given, environment)
@@ -71,9 +71,8 @@ def test_small_pictures_have_the_light_of_every_pixel(size: tuple[int, int]) -> 
     assert np.array_equal(derived_diffuse(given, environment), d)
 
 
-@pytest.mark.parametrize("size", [(240, 300), (300, 220)])
-def test_large_pictures_have_nearly_the_light_of_every_pixel(size: tuple[int, int]) -> None:
-    given, environment = surface(*size), light(16)
+def test_large_pictures_have_nearly_the_light_of_every_pixel() -> None:
+    given, environment = surface(300, 220), light(16)
     inside = interior(given)
     s, d = every_pixel(given, environment)
     derived = derived_specular(given, environment), derived_diffuse(given, environment)

@@ -64,6 +64,11 @@ def error_at(name: str, steps: int, t: int) -> float:
     return float((path(name, steps, noise)[t] - flow(noise, t)).abs().max())
 
 
+def test_one_step_is_the_mean() -> None:
+    x = denoise(exact_denoiser, torch.randn(4, 1, 8, 8), make_scheduler(), 1)
+    torch.testing.assert_close(x, torch.full_like(x, MU))
+
+
 @pytest.mark.parametrize("name", SAMPLERS)
 def test_every_number_of_steps_starts_at_pure_noise_and_is_finite(name: str) -> None:
     noise = torch.linspace(-2, 2, 64).reshape(1, 1, 8, 8)

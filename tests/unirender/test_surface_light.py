@@ -53,7 +53,7 @@ def test_mirror_limit_reads_the_reflected_radiance() -> None:
     np.testing.assert_allclose(s[central], expected[central], rtol=0.03)
 
 
-@pytest.mark.parametrize("roughness", [0.2, 0.34, 0.4, 0.6, 1.0])
+@pytest.mark.parametrize("roughness", [0.2, 0.4, 0.6])
 def test_specular_light_against_monte_carlo(roughness: float) -> None:
     """Uniform directions on the sphere, the GGX formula written out again."""
     normal = np.zeros((2, 2, 3), dtype=np.float32)
@@ -95,14 +95,14 @@ def test_sharp_and_wide_lobes_meet() -> None:
     assert -10 * np.log10(np.mean((a - b) ** 2)) > 35
 
 
-@pytest.mark.parametrize("roughness", [0.1, 0.34, SHARP_ROUGHNESS - 0.01, SHARP_ROUGHNESS, 0.6])
+@pytest.mark.parametrize("roughness", [0.1, SHARP_ROUGHNESS - 0.01, SHARP_ROUGHNESS])
 def test_no_energy_is_made(roughness: float) -> None:
     """Under uniform light a reflector of F = 1 gives back no more than it gets, at grazing angles too."""
     furnace = specular_light(sphere_normals(48), roughness, np.ones((64, 128, 3), dtype=np.float32))
     assert furnace.max() < 1.03
 
 
-@pytest.mark.parametrize("roughness", [0.02, 0.1, 0.15, 0.3, 0.44, 0.5, 0.7, 1.0])
+@pytest.mark.parametrize("roughness", [0.02, 0.15, 0.44, 0.5, 1.0])
 def test_a_white_furnace_seen_from_ahead(roughness: float) -> None:
     """Its closed form: with v = n, l is at twice the angle of h, so that f cos is D(theta / 2) G1(theta) / 4.
 
@@ -119,7 +119,7 @@ def test_a_white_furnace_seen_from_ahead(roughness: float) -> None:
         assert expected == pytest.approx(1 - np.log(2), abs=1e-6)
 
 
-@pytest.mark.parametrize("roughness", [0.02, 0.1, 0.15, 0.3])
+@pytest.mark.parametrize("roughness", [0.02, 0.15])
 def test_a_sharp_reflector_gives_back_a_white_furnace(roughness: float) -> None:
     normal = sphere_normals(16)[sphere_normals(16)[..., 2] > 0.5]
     view = np.tile(np.array([0, 0, 1], np.float32), (len(normal), 1))
@@ -127,7 +127,7 @@ def test_a_sharp_reflector_gives_back_a_white_furnace(roughness: float) -> None:
     np.testing.assert_allclose(furnace, 1, rtol=0, atol=0.03)
 
 
-@pytest.mark.parametrize("roughness", [0.1, 0.3, 0.6, 1.0])
+@pytest.mark.parametrize("roughness", [0.1, 0.6])
 def test_the_light_of_a_point_does_not_depend_on_those_beside_it(roughness: float) -> None:
     """Points of similar normals share the texels that they look at: none is left out that one of them sees."""
     normal = random_directions(300).astype(np.float32)
@@ -140,7 +140,7 @@ def test_the_light_of_a_point_does_not_depend_on_those_beside_it(roughness: floa
         np.testing.assert_allclose(together[i], alone[0], rtol=1e-3, atol=1e-6)
 
 
-@pytest.mark.parametrize("alpha", [0.1, 0.4, 1.0])
+@pytest.mark.parametrize("alpha", [0.1, 1.0])
 def test_reflection_is_reciprocal(alpha: float) -> None:
     """f(l, v) = f(v, l): light and viewer can change places."""
     shape, n = (16, 32), np.tile(np.array([[0], [0.6], [0.8]], np.float32), 40)
@@ -153,7 +153,7 @@ def test_reflection_is_reciprocal(alpha: float) -> None:
     assert f.max() > 1.2 * f.min()
 
 
-@pytest.mark.parametrize("roughness", [0.05, 0.2, 0.5])
+@pytest.mark.parametrize("roughness", [0.05, 0.5])
 def test_the_mirror_image_of_a_scene_has_the_mirrored_light(roughness: float) -> None:
     normal = sphere_normals(30)
     environment = RNG.gamma(0.3, 1, (16, 32, 3)).astype(np.float32)
@@ -201,7 +201,7 @@ def sun(height: int = 64) -> np.ndarray:
     return environment
 
 
-@pytest.mark.parametrize("roughness", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("roughness", [0.1, 0.3])
 def test_sharp_lobes_see_a_sun_in_their_tails(roughness: float) -> None:
     """Against the lobe summed over a map refined 8 times, bilinear as the map itself."""
     directions = np.array([[0, 0, 1], [0.3, 0.3, 0.9], [0, 0.38, 0.92], [0.1, 0.5, 0.85]], dtype=np.float32)
@@ -266,7 +266,7 @@ def rounded_edge(size: int, radius: float) -> np.ndarray:
     return np.repeat(normal[None], size, axis=0).astype(np.float32)
 
 
-@pytest.mark.parametrize("roughness", [0.1, 0.3, 0.5])
+@pytest.mark.parametrize("roughness", [0.1, 0.5])
 def test_light_of_an_edge_as_wide_as_a_pixel(roughness: float) -> None:
     """The light of mean normals is nearer to the mean of a fine picture's light than that of points is."""
     normal = rounded_edge(16 * 16, 0.7)
@@ -288,7 +288,7 @@ def test_light_of_an_edge_as_wide_as_a_pixel(roughness: float) -> None:
     assert error < 0.5 * twin, f"{error:.4f}, points {twin:.4f}"
 
 
-@pytest.mark.parametrize("roughness", [0.1, 0.3, 0.5])
+@pytest.mark.parametrize("roughness", [0.1, 0.5])
 def test_noisy_normals_are_not_made_worse(roughness: float) -> None:
     """Of normals with noise of 3 degrees, as a network predicts them, averages are nearer to the truth than points."""
     normal, light = sphere_normals(48), (RNG.random((32, 64, 3), dtype=np.float32) ** 8 * 4).astype(np.float32)

@@ -80,7 +80,7 @@ def test_a_result_without_its_state_is_not_replaced(
 def test_a_second_run_in_one_folder_is_refused(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_dataset(tmp_path / "data", size=64)
+    write_dataset(tmp_path / "data", size=64, shards=1, groups=1)
     with made_folder(tmp_path / "run"), locked(tmp_path / "run"), pytest.raises(SystemExit) as stopped:
         cli.main([command, "--data", str(tmp_path / "data"), "--out", str(tmp_path / "run"), "--steps", "1"])
     assert stopped.value.code == 1

@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from unirender.training.loop import checkpoint
 from unirender.training.loop.checkpoint import load_state
 from unirender.training.shadows.command import TrainVisibility, rate, split, train_visibility
 from unirender.training.shadows.loss import terms
-from unirender.training.shadows.rays import DIRECTIONS, STEPS, VisibilityItem, look_at, read_items
+from unirender.training.shadows.rays import DIRECTIONS, STEPS, VisibilityItem, _prepare, look_at, read_items
 
 SIZE = 32
 
@@ -127,10 +128,10 @@ def test_a_folder_is_looked_at_once(folder: Path, caplog: pytest.LogCaptureFixtu
     assert np.abs(items[1].hidden.astype(int) - own.hidden).mean() < 0.05 < own.hidden.mean()
 
 
-def test_a_folder_of_pictures_is_refused(tmp_path: Path) -> None:
+def test_a_shard_of_pictures_is_refused(tmp_path: Path) -> None:
     write_shard(tmp_path / "shard-000000.tar", {"a": {"shared.exr": b"", "json": b"{}"}})
     with pytest.raises(UnirenderError, match="--vary visibility"):
-        read_items(tmp_path)
+        _prepare(tmp_path / "shard-000000.tar", "")  # in this process: none to start
 
 
 def test_the_loss_is_that_of_the_equations() -> None:
@@ -198,21 +199,19 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(
         train_visibility(TrainVisibility(folder, tmp_path / "stopped", steps=4, batch_size=3))
 
 
-@pytest.mark.usefixtures("a_hangup_counts")
-@pytest.mark.parametrize("number", SIGNALS)
 def test_asked_to_stop_it_saves_and_the_status_tells_by_what(
-    number: int, tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from unirender.training.shadows import command as visibility
 
     def asked(*arguments: object) -> float:
-        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGTERM)
         return rate(*arguments)  # pyright: ignore[reportArgumentType] - as it is called
 
     monkeypatch.setattr(visibility, "rate", asked)
     with pytest.raises(SystemExit) as stopped:
         cli.main(["train-visibility", "--data", str(folder), "--out", str(tmp_path / "run"), "--batch-size", "1"])
-    assert stopped.value.code == 128 + number
+    assert stopped.value.code == 128 + signal.SIGTERM
     assert capsys.readouterr().err.endswith("unirender: interrupted; run the same command again to go on\n")
     assert load_state(tmp_path / "run")["step"] == 1  # pyright: ignore[reportOptionalSubscript] - it was saved
 

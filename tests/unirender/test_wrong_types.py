@@ -50,7 +50,6 @@ image = np.full((16, 24, 3), 0.5, np.float32)
 decomposition = pipeline.decompose(image, mask)
 light = np.ones((16, 32, 3), np.float32)
 renderer = Renderer(make_object(1, 'train'), resolution=8)
-renderer.image(light, 0.5, 0.5, 16)
 maps, bytes_8 = decomposition.intrinsics, (200 * light).astype(np.uint8)
 photograph = Image.fromarray(bytes_8)
 for case in %r:
@@ -137,7 +136,7 @@ CASES = {
     "renderer.image(light, 0.5, 0.5, 16, pose=np.eye(4)[:3])": "pose: the pose is no rotation and position; expected",
     "renderer.image(light, 0.5, 0.5, 16, pose=np.insert(np.eye(4)[:3], 3, [0, 0, 4, 1], 0))": "pose: the pose is no",
     "renderer.image(light, 0.5, 0.5, 16, pose='front')": "pose: got str 'front', expected numbers",
-    "Renderer(make_object(1, 'train'), resolution=8.5)": "resolution: got 8.5, expected a whole number of pixels",
+    "Renderer(renderer.obj, resolution=8.5)": "resolution: got 8.5, expected a whole number of pixels",
     "make_light('a', 'train')": "make_light: got seed 'a', split 'train'; expected seed >= 0",
     "Light('a', light.tolist())": "light: got name 'a' and an environment of type list, expected a text and a",
     "replace(renderer.obj, albedo=0.5)": "train-000001: got albedo 0.5, expected a numpy array",
@@ -170,7 +169,7 @@ CASES = {
     "shade_gradients(maps, [[1.0]], light)": "shade_gradients: got an image gradient of shape (1, 1), expected finite",
     "shade_gradients(maps, 'x', light)": "image gradient: got str 'x', expected numbers",
     "shade_gradients(maps, image, light, wrt='gloss')": "shade_gradients: got wrt=('gloss',), expected some of albedo,",
-    "SceneSpec(make_object(1, 'train'), make_light(1, 'train'), 'a', 0.0)": "scene: got roughness 'a', expected a",
+    "SceneSpec(renderer.obj, make_light(1, 'train'), 'a', 0.0)": "scene: got roughness 'a', expected a",
     "SceneSpec('ball', make_light(1, 'train'), 0.5, 0.0)": "scene: got obj 'ball', expected MeshObject",
     "make_object('a', 'train')": "make_object: got seed 'a', split 'train'; expected seed >= 0",
     "UniRenderPipeline.from_pretrained(123)": "checkpoint: got 123, expected the path of a pipeline folder",
