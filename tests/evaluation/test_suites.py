@@ -12,12 +12,14 @@ from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender_evaluation.suites.spec import read_spec, suite_path
 from unirender_evaluation.suites.stratification import stratified_materials
-from unirender_evaluation.suites.suite import (
-    load_suite,
-    material_key,
-)
+from unirender_evaluation.suites.suite import Suite, load_suite, material_key
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import scene_ids, tasks
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
+    return make_suite(tmp_path_factory.mktemp("suites"))
 
 
 def test_tiny_materials_are_stratified_and_independent() -> None:
@@ -97,9 +99,8 @@ def test_broken_suite_files_are_named(tmp_path: Path) -> None:
             read_spec(broken)
 
 
-def test_methods_see_eight_bits_and_nothing_else(tmp_path: Path) -> None:
+def test_methods_see_eight_bits_and_nothing_else(suite: Suite) -> None:
     """No leakage: every input is the quantised picture, mask, camera and what the protocol gives away."""
-    suite = make_suite(tmp_path)
     allowed = {
         "from-image": {"edit": {"image_srgb", "mask", "camera", "metallic", "roughness"}},
         "single-image": {"decompose": {"image_srgb", "mask", "camera"}},
@@ -136,9 +137,8 @@ def test_methods_see_eight_bits_and_nothing_else(tmp_path: Path) -> None:
     assert seen > 0
 
 
-def test_an_unquantised_picture_would_be_caught(tmp_path: Path) -> None:
+def test_an_unquantised_picture_would_be_caught(suite: Suite) -> None:
     """Twin of the leakage test: the linear truth itself has more than 8 bits."""
-    suite = make_suite(tmp_path)
     truth = suite.image(suite.scenes[0], suite.spec.base)
     task = next(tasks(suite, "rendering", "from-image", list(suite.scenes)))
     seen = task.inputs["edit"]["image_srgb"]
@@ -147,28 +147,25 @@ def test_an_unquantised_picture_would_be_caught(tmp_path: Path) -> None:
     assert np.abs(srgb_decode(seen) * task.mask - truth).max() < 0.01
 
 
-def test_what_a_suite_keeps_cannot_be_written_into(tmp_path: Path) -> None:
-    suite = make_suite(tmp_path)
+def test_what_a_suite_keeps_cannot_be_written_into(suite: Suite) -> None:
     scene = suite.scenes[0]
     with pytest.raises(ValueError, match="read-only"):
         suite.mask(scene)[...] = 0
     for array in (suite.image(scene, suite.spec.base), suite.environment(scene)):
         array[...] = 0
-    again = make_suite(tmp_path)
+    again = load_suite(suite.spec.path)
     assert np.array_equal(suite.image(scene, suite.spec.base), again.image(scene, suite.spec.base))
     assert np.array_equal(suite.environment(scene), again.environment(scene))
 
 
-def test_limited_runs_take_scenes_evenly(tmp_path: Path) -> None:
-    suite = make_suite(tmp_path)
+def test_limited_runs_take_scenes_evenly(suite: Suite) -> None:
     assert len(scene_ids(suite, None)) == 4
     assert [s.key for s in scene_ids(suite, 2)] == [suite.scenes[0].key, suite.scenes[-1].key]
     with pytest.raises(UnirenderError, match="at least 1"):
         scene_ids(suite, 0)
 
 
-def test_scenes_have_twins_where_the_suite_says(tmp_path: Path) -> None:
-    suite = make_suite(tmp_path)
+def test_scenes_have_twins_where_the_suite_says(suite: Suite) -> None:
     first, second = suite.scenes[:2]
     base, rough = suite.spec.base, suite.spec.base[1]
     for material in (base, *suite.spec.edits):

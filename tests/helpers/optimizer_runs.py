@@ -1,6 +1,7 @@
 """A small optimisation that tests run, kill and resume: `python optimizer_runs.py FOLDER` runs it, too."""
 
 import dataclasses
+import functools
 import sys
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ REFINE = RefineConfig(iterations=8, spp=4, spp_gradient=4, depth=2, held_out_eve
 CONFIG = OptimizeConfig(refine=REFINE, save_seconds=0.0)
 
 
+@functools.cache
 def truth(seed: int = 3) -> Solution:
     return Solution(textured_object(seed), environment(1) * np.float32(0.3))
 
@@ -51,12 +53,17 @@ def flat_start(obj: MeshObject, size: int = 16) -> Solution:
     return Solution(textured, np.full((8, 16, 3), 0.3, np.float32))
 
 
+@functools.cache
+def _pictures() -> Views:
+    return rendered_views(truth())
+
+
 def run(out: Path | None, config: OptimizeConfig = CONFIG, **options: Any) -> Solution:
     """The run, on one thread; equal bytes whenever it is run."""
     solution = truth()
     start = flat_start(solution.obj)
     options = {"init": start, "threads": 1, "pictures": False, **options}
-    return optimize(rendered_views(solution), None, config, out, **options)
+    return optimize(_pictures(), None, config, out, **options)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,9 @@
 """A closed-form suite of two scenes, written in milliseconds: the composite is its truth, with a stated noise."""
 
+import functools
 import hashlib
 import json
+import tempfile
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
@@ -34,6 +36,20 @@ TWIN_SCENE = (0, 0)  # the object and light whose base, edits, s and d have a tw
 def write_suite(folder: Path, objects: int = 2, per_scene: int = 2) -> Path:
     """Writes `ball.toml` and `ball.tar`: spheres under two lights, images by the composite. Returns the TOML's path."""
     folder.mkdir(parents=True, exist_ok=True)
+    for name, content in _files(objects, per_scene).items():
+        (folder / name).write_bytes(content)
+    return folder / "ball.toml"
+
+
+@functools.cache
+def _files(objects: int, per_scene: int) -> dict[str, bytes]:
+    """Made once in a process: many tests have a suite of their own."""
+    with tempfile.TemporaryDirectory() as folder:
+        _make(Path(folder), objects, per_scene)
+        return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+
+
+def _make(folder: Path, objects: int, per_scene: int) -> None:
     text = (resources.files("unirender_evaluation") / "data/suites/tiny.toml").read_text()
     lines = []
     changes = {
@@ -87,7 +103,6 @@ def write_suite(folder: Path, objects: int = 2, per_scene: int = 2) -> Path:
     write_tar(spec.truth_path, members)
     digest = hashlib.sha256(spec.truth_path.read_bytes()).hexdigest()
     path.write_text(path.read_text().replace('sha256 = ""', f'sha256 = "{digest}"'))
-    return path
 
 
 def make_suite(folder: Path, **options: int) -> Suite:

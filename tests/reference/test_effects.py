@@ -17,7 +17,6 @@ from unirender_reference.statistics import ZTest, z_test
 SIZE = 24
 SPP = 8 * 144
 MATERIALS = {"glossy metal": (0.15, 1.0), "rough dielectric": (0.6, 0.0)}
-MOST_AT_LENGTH = ["glossy metal", pytest.param("rough dielectric", marks=pytest.mark.long)]
 
 
 def compare(a: Estimate, b: Estimate, mask: np.ndarray | None = None) -> ZTest:
@@ -52,7 +51,7 @@ def test_nothing_shadows_or_lights_a_convex_object() -> None:
     assert effects.unshadowed.mean[..., :3].max() > 0.1
 
 
-@pytest.mark.parametrize("material", MOST_AT_LENGTH)
+@pytest.mark.parametrize("material", ["glossy metal", pytest.param("rough dielectric", marks=pytest.mark.long)])
 def test_each_effect_of_an_open_book(material: str) -> None:
     """Pages alone have no shadow: their direct light is the unshadowed light of the book.
 
@@ -114,8 +113,9 @@ def test_total_adds_radiance_and_variance_and_keeps_alpha() -> None:
     assert Effects(parts[0], parts[1], Estimate(parts[2].mean, None)).total().variance is None
 
 
-@pytest.mark.parametrize("material", MOST_AT_LENGTH)
-@pytest.mark.parametrize("shape", [pytest.param("torus", marks=pytest.mark.long), "assembly"])
+@pytest.mark.long
+@pytest.mark.parametrize("material", MATERIALS)
+@pytest.mark.parametrize("shape", ["torus", "assembly"])
 def test_effects_add_up_to_the_full_render(shape: str, material: str, torus: Renderer) -> None:
     roughness, metallic = MATERIALS[material]
     if shape == "assembly":
@@ -152,7 +152,7 @@ def test_maps_and_bumped_normals_add_up_too() -> None:
 
 
 def test_depth_two_has_no_interreflection_and_depth_one_is_refused(torus: Renderer) -> None:
-    effects = render_effects(torus, scenes.environment(), 0.4, 0.5, 16, depth=DIRECT_DEPTH, batches=1)
+    effects = render_effects(torus, scenes.environment(), 0.4, 0.5, 9, depth=DIRECT_DEPTH, batches=1)
     assert not effects.interreflection.mean[..., :3].any()
     assert effects.total().variance is None
     with pytest.raises(UnirenderError, match="expected a whole number from 2"):
