@@ -71,6 +71,8 @@ def test_a_run_of_strangers_alone_says_that_there_is_none() -> None:
     say_no_rows(("trivial", "plugins"), [make_row(UneditedInput(), "trivial")], said.append)
     assert said == []
     say_no_rows(("plugins",), [], said.append)
+    say_no_rows((), [], said.append)  # --methods without a word behind it
+    assert len(said) == 2
     assert "there is no row of yours, and only bounds are scored; name it by --predictions" in said[0]
 
 

@@ -86,10 +86,10 @@ def say_missing(
 
 def say_no_rows(methods: Sequence[str], rows: Sequence[Row], say: Callable[[str], None]) -> None:
     """Says that nothing but the bounds is scored, where strangers alone are asked for and there is none."""
-    if tuple(methods) == ("plugins",) and not any(row.info.kind == "external" for row in rows):
+    if set(methods) <= {"plugins"} and not any(row.info.kind == "external" for row in rows):
         say(
-            "--methods plugins: there is no row of yours, and only bounds are scored; name it by --predictions "
-            "NAME=FOLDER or --method FILE.py:CLASS"
+            f"{' '.join(['--methods', *methods])}: there is no row of yours, and only bounds are scored; name it by "
+            "--predictions NAME=FOLDER or --method FILE.py:CLASS"
         )
 
 
