@@ -63,6 +63,11 @@ def test_a_question_without_a_value_is_not_answered(tmp_path: Path, as_folder: b
     assert edit.identity not in questions
     assert other.identity in questions
     assert unanswered(suite, rows[:1], scenes, [record]) == {}
+    said: list[str] = []
+    files = missing_answers(suite, rows, scenes)
+    say_missing(tmp_path, unanswered(suite, rows, scenes, []), said.append, without_files=files)
+    why = " (1 more have a file, but no map that is scored there)" if as_folder else ""
+    assert said == [f"mine: answers 0 of {asked} questions{why}; the others: {tmp_path / 'missing.txt'}"]
 
 
 def test_a_run_of_strangers_alone_says_that_there_is_none() -> None:
