@@ -20,7 +20,7 @@ class BenchCrosscheck:
     pairs: int = 6
     """Pairs of random pictures of each size, from nearly alike to unrelated."""
     seed: int = 0
-    """Of the random pictures."""
+    """Seed of the random pictures."""
 
     def check(self) -> None:
         """Looks at the values; `UsageError` where one is outside its range."""

@@ -31,7 +31,7 @@ class BenchShards:
     pairs: int = 2
     """Pictures drawn of each object."""
     seed: int = 0
-    """Of what is drawn."""
+    """Seed of what is drawn."""
     renders: bool = False
     """Render the pictures as well: from their true maps, and from those but s and d."""
     out: Path | None = None

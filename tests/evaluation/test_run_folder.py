@@ -63,6 +63,11 @@ def test_a_question_without_a_value_is_not_answered(tmp_path: Path, as_folder: b
     assert edit.identity not in questions
     assert other.identity in questions
     assert unanswered(suite, rows[:1], scenes, [record]) == {}
+    said: list[str] = []
+    files = missing_answers(suite, rows, scenes)
+    say_missing(tmp_path, unanswered(suite, rows, scenes, []), said.append, without_files=files)
+    why = " (1 more have a file, but no map that is scored there)" if as_folder else ""
+    assert said == [f"mine: answers 0 of {asked} questions{why}; the others: {tmp_path / 'missing.txt'}"]
 
 
 def test_a_run_of_strangers_alone_says_that_there_is_none() -> None:
@@ -71,6 +76,8 @@ def test_a_run_of_strangers_alone_says_that_there_is_none() -> None:
     say_no_rows(("trivial", "plugins"), [make_row(UneditedInput(), "trivial")], said.append)
     assert said == []
     say_no_rows(("plugins",), [], said.append)
+    say_no_rows((), [], said.append)  # --methods without a word behind it
+    assert len(said) == 2
     assert "there is no row of yours, and only bounds are scored; name it by --predictions" in said[0]
 
 

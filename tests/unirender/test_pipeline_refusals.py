@@ -67,7 +67,7 @@ def test_a_light_that_is_none_is_refused(pipeline: UniRenderPipeline, light: np.
         pipeline.relight(image, light.astype(np.float32), mask)
 
 
-@pytest.mark.parametrize("shape", [(64, 64), (16, 24), (17, 32)])
+@pytest.mark.parametrize("shape", [(64, 64), (16, 24), (18, 32)])
 def test_a_light_that_is_no_whole_sphere_is_refused(pipeline: UniRenderPipeline, shape: tuple[int, int]) -> None:
     """A light probe was taken for a lat-long map; the commands refuse its file by the same rule."""
     image, mask = picture()
@@ -77,6 +77,11 @@ def test_a_light_that_is_no_whole_sphere_is_refused(pipeline: UniRenderPipeline,
         pipeline.relight(image, light, mask)
     with pytest.raises(UnirenderError, match=words):
         pipeline.render(surface().replace(environment=light))
+
+
+def test_a_light_with_equal_steps_between_its_poles_is_one(pipeline: UniRenderPipeline) -> None:
+    image, mask = picture()
+    assert pipeline.relight(image, np.ones((17, 32, 3), np.float32), mask).image_linear.shape == image.shape
 
 
 def test_an_unknown_exposure_is_refused(pipeline: UniRenderPipeline) -> None:

@@ -59,9 +59,9 @@ class Figures:
     light that is found. maps, camera: what the data contract says, without a method. These three only where they are
     named. With --pictures metallic and roughness alone."""
     values: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
-    """Of metallic and roughness in the strips, in [0, 1]."""
+    """Values of metallic and roughness in the strips, in [0, 1]."""
     lights: int = 4
-    """Of the relighting grid, and for --pictures."""
+    """How many lights the relighting grid and the sheet of --pictures show."""
     spp: int = 1024
     """Samples per pixel of the truth that is rendered for strips and relighting."""
     device: Device = "cpu"

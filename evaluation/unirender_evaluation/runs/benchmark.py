@@ -115,7 +115,8 @@ def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
     records = [record for record in store.close() if record.values]
     without = unanswered(suite, here.rows, here.scenes, records)
     write_missing(config.out, without)
-    say_missing(config.out, {label: found for label, found in without.items() if found != missing.get(label)}, say)
+    news = {label: found for label, found in without.items() if found != missing.get(label)}
+    say_missing(config.out, news, say, without_files=missing)
     say_rows_without_values(here.rows, records, say)
     if others := store.of_other_code():
         say(f"{others} records of other code are not used; {store.unused_path} keeps the last {KEPT} of each")

@@ -45,7 +45,7 @@ class BenchRun:
     limit: int | None = None
     """Scenes; the tables of a partial run carry a watermark."""
     seed: int = 0
-    """Of sampling methods."""
+    """Seed of sampling methods."""
     check_scenes: int = 4
     """Scenes that Mitsuba renders again on the spot; 0: none, and the tables say that their truth is unchecked."""
     check_seed: int | None = None

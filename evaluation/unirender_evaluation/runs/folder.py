@@ -5,6 +5,7 @@ import contextlib
 import errno
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from unirender.errors import UnirenderError
 from unirender.system.whole_files import replace_file
@@ -76,20 +77,27 @@ def write_missing(folder: Path, missing: Mapping[str, tuple[list[str], int]]) ->
 
 
 def say_missing(
-    folder: Path, missing: Mapping[str, tuple[list[str], int]], say: Callable[[str], None], what: str = "answers"
+    folder: Path,
+    missing: Mapping[str, tuple[list[str], int]],
+    say: Callable[[str], None],
+    what: str = "answers",
+    without_files: Mapping[str, tuple[list[str], int]] = MappingProxyType({}),
 ) -> None:
-    """Says how many questions have an answer, or `what` there is of them."""
+    """Says how many questions have an answer, or `what` there is of them, and, where it is told which of them have no
+    file, how many of the others have one that says nothing."""
     for label, (questions, asked) in missing.items():
+        unscored = len(questions) - len(without_files[label][0]) if label in without_files else 0
+        why = f" ({unscored} more have a file, but no map that is scored there)" if unscored else ""
         listed = f"; the others: {folder / MISSING}" if questions else ""
-        say(f"{label}: {what} {asked - len(questions)} of {asked} questions{listed}")
+        say(f"{label}: {what} {asked - len(questions)} of {asked} questions{why}{listed}")
 
 
 def say_no_rows(methods: Sequence[str], rows: Sequence[Row], say: Callable[[str], None]) -> None:
     """Says that nothing but the bounds is scored, where strangers alone are asked for and there is none."""
-    if tuple(methods) == ("plugins",) and not any(row.info.kind == "external" for row in rows):
+    if set(methods) <= {"plugins"} and not any(row.info.kind == "external" for row in rows):
         say(
-            "--methods plugins: there is no row of yours, and only bounds are scored; name it by --predictions "
-            "NAME=FOLDER or --method FILE.py:CLASS"
+            f"{' '.join(['--methods', *methods])}: there is no row of yours, and only bounds are scored; name it by "
+            "--predictions NAME=FOLDER or --method FILE.py:CLASS"
         )
 
 

@@ -39,7 +39,7 @@ class Lights:
     holdout: int = HOLDOUT
     """Every so many-th place of that folder is for test."""
     share: float = SHARE
-    """Of the seeds that draw from that folder, in (0, 1]; with `--pool` and `--draw`."""
+    """Share of the seeds that draw from that folder, in (0, 1]; with `--pool` and `--draw`."""
     export: Path | None = None
     """New folder for the lights shown: an EXR (float32, on the contract's grid) and a PNG preview of each."""
     sheet: Path | None = None

@@ -59,9 +59,9 @@ class Optimize:
     hold_out: int = 0
     """Every N-th picture is only watched, for the early stop. 0: those that the folder holds out."""
     most_views: int | None = None
-    """Of more pictures, this many are taken, evenly spread."""
+    """Where there are more pictures, this many are taken, evenly spread."""
     threads: int = 0
-    """Of the renderer. 0: one for each core. 1: equal runs give equal bytes."""
+    """Threads of the renderer. 0: one for each core. 1: equal runs give equal bytes."""
     mask: Path | None = None
     """Of one picture: its coverage (white: object). None: the alpha channel, else the whole frame."""
     fov: float | None = None

@@ -60,9 +60,9 @@ class Train:
     """Where batches are mixed and augmented. device: on the GPU, in whose memory the packed data then lie. auto: there,
     where they take no more than a third of what is free; else on the CPU."""
     dtype: DType = "auto"
-    """Of the autocast; weights stay float32. auto: bfloat16 only on hardware that computes in it."""
+    """Precision of the autocast; weights stay float32. auto: bfloat16 only on hardware that computes in it."""
     seed: int = 0
-    """Of the weights, the data order and the noise."""
+    """Seed of the weights, the data order and the noise."""
     parallel: int | None = None
     """Parts of a batch that run side by side on a CPU, one thread each. None: PyTorch's thread count."""
     accumulate: int = 1

@@ -31,7 +31,7 @@ class BenchDerivedLight:
     objects: tuple[int, ...] = (2, 5)
     """Seeds of procedural objects (training families) beside the sphere."""
     roughness: tuple[float, ...] = (0.1, 0.3, 0.5, 0.8)
-    """Of s."""
+    """Roughness values of s."""
     resolution: int = 64
     """Pixels along each side."""
 

@@ -24,7 +24,7 @@ class BenchIngredients:
     variants: Annotated[tuple[str, ...], tyro.conf.arg(help_behavior_hint="(default: all)")] = ()
     """Rows by name, or groups of them: start, refinement, priors, grey. The full method is always one."""
     seed: int = 0
-    """Of the optimiser."""
+    """Seed of the optimiser."""
 
     def check(self) -> None:
         """Looks at the values; `UsageError` where one is outside its range."""
@@ -75,7 +75,7 @@ class BenchRace:
     objects: int = 4
     """Objects, evenly spaced."""
     seed: int = 0
-    """Of both."""
+    """Seed of both."""
 
     def check(self) -> None:
         """Looks at the values; `UsageError` where one is outside its range."""

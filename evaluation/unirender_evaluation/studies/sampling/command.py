@@ -26,13 +26,13 @@ class BenchSampling:
     scenes: int = 16
     """Scenes, evenly spaced over the suite, a picture each."""
     steps: tuple[int, ...] = (1, 2, 4, 10, 20)
-    """Of mode `sample`."""
+    """Numbers of steps of mode `sample`."""
     samples: tuple[int, ...] = (1, 5, 16)
     """Averaged in mode `sample`; calibration is that of the most."""
     sampler: Literal["ddim", "unipc"] = "ddim"
-    """Of mode `sample`."""
+    """Sampler of mode `sample`."""
     seed: int = 0
-    """Of the noise."""
+    """Seed of the noise."""
     device: Device = "cpu"
     """Where the model runs. auto: cuda, then mps, then cpu, whichever is there."""
 

@@ -43,13 +43,13 @@ class BenchSpeed:
     checkpoint: Path | None = None
     """Folder of our model, or a shipped one by its name. None: tiny."""
     preset: str = "tiny"
-    """Of the part training: a row of `unirender.training.presets.PRESETS`."""
+    """Preset of the part training: a row of `unirender.training.presets.PRESETS`."""
     device: Device = "cpu"
     """Where the model runs and is trained. auto: cuda, then mps, then cpu, whichever is there."""
     dtype: DType = "auto"
-    """Of the model, and of the autocast in training. auto: bfloat16 only on hardware that computes in it."""
+    """Precision of the model, and of the autocast in training. auto: bfloat16 only on hardware that computes in it."""
     repeats: int = 9
-    """Of every measure whose median is taken; half as many of cold starts."""
+    """Repetitions of every measure whose median is taken; half as many of cold starts."""
 
     def check(self) -> tuple[PartName, ...]:
         """Looks at the values; the parts that will be measured.

@@ -29,7 +29,7 @@ class BenchTraining:
     scenes: int = 24
     """Scenes of the suite, evenly spaced, that every network is scored on."""
     steps: int = 1000
-    """Of every training."""
+    """Steps of every training."""
     preset: str = "tiny_plain"
     """What every row is a change of. `tiny_plain`: the paper's plain model."""
     choices: tuple[str, ...] = ()
@@ -42,7 +42,7 @@ class BenchTraining:
     device: Device = "auto"
     """As for `unirender train`."""
     seed: int = 0
-    """Of weights, data order and noise."""
+    """Seed of weights, data order and noise."""
 
     def check(self) -> None:
         """Looks at the values.

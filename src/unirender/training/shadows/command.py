@@ -55,7 +55,7 @@ class TrainVisibility:
     halved: float = 0.6
     """Share of the objects that are seen at half their size."""
     seed: int = 0
-    """Of the weights, of the order of objects, of the lights."""
+    """Seed of the weights, the order of objects and the lights."""
 
     def check(self) -> None:
         """Looks at the values.
