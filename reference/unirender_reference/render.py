@@ -144,7 +144,7 @@ class Renderer:
         """
         if not isinstance(depth, Integral) or not (DIRECT_DEPTH <= depth <= MOST_DEPTH or depth == UNLIMITED):
             raise UnirenderError(
-                f"depth: got {depth!r:.40}, expected {DIRECT_DEPTH} (one bounce) to {MOST_DEPTH}, or {UNLIMITED}: no end"
+                f"depth: got {depth!r:.40}, expected {DIRECT_DEPTH} (one bounce) to {MOST_DEPTH}, {UNLIMITED}: no end"
             )
         scene = self.lit("principled", {"roughness": roughness, "metallic": metallic}, environment)
         sensor = None if pose is None else sensor_at(pose, self.camera, self.resolution, self.resolution)
