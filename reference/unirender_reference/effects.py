@@ -31,7 +31,7 @@ from unirender_reference.passes import (
     mean_estimate,
     ratio_estimate,
 )
-from unirender_reference.render import DIRECT_DEPTH, IMAGE_DEPTH, Renderer
+from unirender_reference.render import DIRECT_DEPTH, IMAGE_DEPTH, MOST_DEPTH, Renderer
 
 EFFECTS = ("unshadowed", "shadow", "interreflection")
 
@@ -69,8 +69,10 @@ def render_effects(
     Raises:
         UnirenderError: `depth` is no whole number of at least 2, or as `Renderer.image`.
     """
-    if not isinstance(depth, Integral) or depth < DIRECT_DEPTH:
-        raise UnirenderError(f"depth: got {depth!r:.40}, expected a whole number from {DIRECT_DEPTH}, one bounce")
+    if not isinstance(depth, Integral) or not DIRECT_DEPTH <= depth <= MOST_DEPTH:
+        raise UnirenderError(
+            f"depth: got {depth!r:.40}, expected a whole number from {DIRECT_DEPTH}, one bounce, to {MOST_DEPTH}"
+        )
     scene = renderer.lit("principled", {"roughness": roughness, "metallic": metallic}, environment)
     integrators = {
         "unshadowed": python_integrator(_unshadowed),

@@ -59,7 +59,7 @@ def scalar_bitmap(texture: Float[np.ndarray, "h w"]) -> dict[str, Any]:
 
 
 def _bitmap(picture: Float[np.ndarray, "h w c"]) -> dict[str, Any]:
-    bitmap = mitsuba().Bitmap(np.ascontiguousarray(picture, dtype=np.float32))
+    bitmap = mitsuba().Bitmap(np.require(picture, np.float32, ["C", "W"]))  # writable: Mitsuba takes no other
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
 
 

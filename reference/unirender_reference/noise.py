@@ -82,9 +82,15 @@ def masked_noise_mse(
         premultiplied: whether `mean` is.
         space: in which the error is taken, both clipped to [0, 1].
     """
+    mask = _wide(mask)
     scale = np.maximum(mask, MIN_MASK) if premultiplied else 1.0
     error = display_slope(mean / scale, space) ** 2 * variance / np.square(scale)
     return float(np.sum(mask * error) / (error.shape[-1] * np.sum(mask)))
+
+
+def _wide(mask: Mask) -> Mask:
+    """A mask of half floats, as an EXR has it, as float32: its sum is beyond them, and squares of its edges are 0."""
+    return np.asarray(mask, np.result_type(mask, np.float32))
 
 
 def noise_floor_db(mean: Picture, variance: Picture, mask: Mask, premultiplied: bool) -> float:
@@ -104,6 +110,7 @@ def floor_range(mean: Picture, variance: Picture, mask: Mask, premultiplied: boo
         mask: coverage: the weight of a pixel.
         premultiplied: whether `mean` is.
     """
+    mask = _wide(mask)
     scale = np.maximum(mask, MIN_MASK) if premultiplied else 1.0
     m = np.asarray(mean / scale, np.float64)
     s = np.sqrt(np.asarray(variance, np.float64)) / scale

@@ -22,6 +22,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.light.environment import as_light
+from unirender.system.machine import memory_excess
 from unirender_reference import exposure
 from unirender_reference.backend import mitsuba
 from unirender_reference.geometry import geometry_buffers
@@ -60,9 +61,11 @@ __all__ = [
 IMAGE_DEPTH = 4
 DIRECT_DEPTH = 2
 UNLIMITED = -1  # as Mitsuba counts bounces
+MOST_DEPTH = 2**31 - 1  # that it counts to
 GEOMETRY_SPP = 256
 LARGE = 128  # pixels along a side; above, edges are a small part of the picture
 LARGE_GEOMETRY_SPP = 25  # one jittered 5 x 5 grid: coverage to about 1/25
+BYTES_A_PIXEL = 250  # of memory: what a pass of one sample a pixel takes
 
 
 class Renderer:
@@ -80,6 +83,8 @@ class Renderer:
                 f"resolution: got {resolution!r:.60}, expected a whole number of pixels, at least 1; "
                 "pictures are square"
             )
+        if excess := memory_excess(BYTES_A_PIXEL * int(resolution) ** 2):
+            raise UnirenderError(f"resolution: got {resolution} pixels a side, which {excess}; render fewer")
         self.obj = as_instance(obj, MeshObject, "renderer")
         self.camera = Camera() if camera is None else as_instance(camera, Camera, "renderer")
         self.resolution = resolution
@@ -137,9 +142,9 @@ class Renderer:
         Raises:
             UnirenderError: an argument is of another type or out of range, or a pixel stays NaN.
         """
-        if not isinstance(depth, Integral) or (depth < DIRECT_DEPTH and depth != UNLIMITED):
+        if not isinstance(depth, Integral) or not (DIRECT_DEPTH <= depth <= MOST_DEPTH or depth == UNLIMITED):
             raise UnirenderError(
-                f"depth: got {depth!r:.40}, expected {DIRECT_DEPTH} (one bounce) or more, or {UNLIMITED} (no end)"
+                f"depth: got {depth!r:.40}, expected {DIRECT_DEPTH} (one bounce) to {MOST_DEPTH}, {UNLIMITED}: no end"
             )
         scene = self.lit("principled", {"roughness": roughness, "metallic": metallic}, environment)
         sensor = None if pose is None else sensor_at(pose, self.camera, self.resolution, self.resolution)

@@ -169,7 +169,7 @@ def object_scene(
     if sensor is not None:
         scene["sensor"] = sensor
     if environment is not None:
-        bitmap = mi.Bitmap(np.ascontiguousarray(envmap_rows(environment)))
+        bitmap = mi.Bitmap(np.require(envmap_rows(environment), requirements=["C", "W"]))  # writable: it takes no other
         scene[LIGHT] = {"type": "envmap", "bitmap": bitmap}
     scene[OBJECT] = mesh_shape(obj, materials.white_bsdf() if bsdf is None else bsdf)
     return mi.load_dict(scene)

@@ -155,5 +155,6 @@ def test_depth_two_has_no_interreflection_and_depth_one_is_refused(torus: Render
     effects = render_effects(torus, scenes.environment(), 0.4, 0.5, 9, depth=DIRECT_DEPTH, batches=1)
     assert not effects.interreflection.mean[..., :3].any()
     assert effects.total().variance is None
-    with pytest.raises(UnirenderError, match="expected a whole number from 2"):
-        render_effects(torus, scenes.environment(), 0.4, 0.5, 16, depth=1)
+    for depth in (1, 2**31):
+        with pytest.raises(UnirenderError, match="expected a whole number from 2"):
+            render_effects(torus, scenes.environment(), 0.4, 0.5, 16, depth=depth)

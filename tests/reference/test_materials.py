@@ -18,6 +18,7 @@ from unirender_reference.backend import mitsuba
 from unirender_reference.integrators import python_integrator
 from unirender_reference.passes import Estimate, integrator_passes, ratio_estimate
 from unirender_reference.render import Renderer, SceneSpec, render_sample, scene_hash
+from unirender_reference.scene import object_scene
 from unirender_reference.shapes import MeshObject
 from unirender_reference.statistics import ZTest, z_test
 
@@ -87,6 +88,21 @@ def test_textures_come_back_texel_by_texel(name: str) -> None:
     assert worst(buffers, name, samples.mean(2), filled) < 4e-3
     for twin in (picture[::-1], picture[:, ::-1], np.roll(picture, 1, axis=1)):
         assert worst(buffers, name, seen(twin, renderer)[0].mean(2), filled) > 0.1
+
+
+def test_arrays_that_are_read_only_are_rendered() -> None:
+    """As numpy hands out what it broadcasts, or maps of a file."""
+    flat = np.broadcast_to(np.array([0, 0, 1], np.float32), (4, 4, 3))
+    maps = {"albedo": texture(1, 8, 7, 3), "roughness": texture(2, 9, 6), "normal_map": flat}
+    for array in maps.values():
+        array.flags.writeable = False
+    light = scenes.environment()
+    light.flags.writeable = False
+    object_scene(quad(**maps), environment=light)
+    read_only, own = (Renderer(quad(**given), resolution=8) for given in (maps, {k: v.copy() for k, v in maps.items()}))
+    shown = [renderer.image(light, None, 0.5, 4, batches=1).mean for renderer in (read_only, own)]
+    assert np.array_equal(shown[0], shown[1])
+    assert shown[0].any()
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

@@ -47,6 +47,17 @@ def test_constant_noise_has_the_closed_form(level: float) -> None:
     assert larger == pytest.approx(exact - 40, abs=0.05), "little noise: curve and tangent agree"
 
 
+def test_a_mask_of_half_floats_is_one_of_coverage() -> None:
+    """Sums of more than 65,504 pixels, and squares of an edge's coverage, are beyond half floats."""
+    mask = np.full((300, 300, 1), 0.5, np.float16)
+    mask[0] = 1e-4
+    mean, variance = np.full((300, 300, 3), 0.2, np.float32) * mask, np.full((300, 300, 3), 1e-8, np.float32) * mask
+    for measure in (noise_floor_db, lambda *given: floor_range(*given)[0]):
+        exact = measure(mean, variance, mask.astype(np.float32), True)
+        assert 60 < exact < 80
+        assert measure(mean, variance, mask, True) == exact
+
+
 def test_coverage_divides_and_weights() -> None:
     """A premultiplied pixel of coverage a: m / a, s / a, weight a; pixels outside count nothing."""
     mask = np.zeros((2, 2, 1), np.float32)

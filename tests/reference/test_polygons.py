@@ -77,6 +77,14 @@ def test_what_no_cut_fills_stays_a_fan(points: np.ndarray) -> None:
     np.testing.assert_array_equal(triangles, fans(np.array([len(points)]))[0])
 
 
+def test_neighbours_that_mirror_each_other_are_two_polygons() -> None:
+    """Roof and its mirror image: they differ in two signs alone, and each begins as written."""
+    roof = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0.225), (0, 1, 0.225)])
+    points = np.concatenate([roof, (roof * [1, 1, -1])[::-1]])
+    sizes = np.array([4, 4])
+    np.testing.assert_array_equal(triangulate(points, sizes)[0], fans(sizes)[0])
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.floats(0.2, 2.0), min_size=4, max_size=12), st.integers(0, 11))
 def test_stars_of_any_radii_are_filled(radii: list[float], start: int) -> None:

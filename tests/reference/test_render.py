@@ -294,6 +294,7 @@ def test_the_camera_in_the_header_is_that_of_the_contract() -> None:
         lambda r: r.diffuse(0 * scenes.environment(), 8),
         lambda r: r.diffuse(np.full((4, 8, 3), np.inf, np.float32), 8),
         lambda r: Renderer(r.obj, resolution=0),
+        lambda r: r.image(scenes.environment(), 0.5, 0.5, 16, depth=2**31),  # Mitsuba counts no further
         lambda r: r.image(scenes.environment(), 0.5, 0.5, 16, pose=np.diag([2.0, 2, 2, 1])),
         lambda r: r.image(scenes.environment(), 0.5, 0.5, 16, pose=np.diag([-1.0, 1, 1, 1])),
         lambda r: r.image(scenes.environment(), 0.5, 0.5, 16, pose=np.full((4, 4), np.nan)),
@@ -306,7 +307,7 @@ def test_the_camera_in_the_header_is_that_of_the_contract() -> None:
         lambda r: bounding_sphere(np.zeros((0, 3))),
     ],
     ids=[
-        *("roughness", "metallic", "batches", "negative", "black", "infinite", "resolution"),
+        *("roughness", "metallic", "batches", "negative", "black", "infinite", "resolution", "endless"),
         *("scaled pose", "mirroring pose", "nan pose", "exposure seed"),
         *("no bounce", "above the zenith", "nan azimuth", "no view", "nan vertices", "no vertices"),
     ],
@@ -314,6 +315,11 @@ def test_the_camera_in_the_header_is_that_of_the_contract() -> None:
 def test_bad_arguments_are_refused(renderer: Renderer, call: Callable[[Renderer], object]) -> None:
     with pytest.raises(UnirenderError, match="expected"):
         call(renderer)
+
+
+def test_a_picture_that_no_machine_holds_is_refused(renderer: Renderer) -> None:
+    with pytest.raises(UnirenderError, match=r"got 1000000000000 pixels a side, which would take about .*; render"):
+        Renderer(renderer.obj, resolution=10**12)
 
 
 def test_paths_without_an_end_are_mitsubas(renderer: Renderer) -> None:

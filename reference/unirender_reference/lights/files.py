@@ -44,6 +44,8 @@ WINDOW_DEG, FADE_DEG = 45.0, 30.0
 MOST_HEADER_BYTES = 2**16  # of a Radiance file
 # Pixels in another order than by rows from the top left, which alone Mitsuba reads.
 RGBE_TURNED = re.compile(rb"#\?.*?\n\n(?!-Y \d+ \+X )([-+][XY] \d+ [-+][XY] \d+)\s*\n", re.DOTALL)
+OLD_RUNS = "its pixels are run-length coded as Radiance did before 1991"
+NEW_RUNS = b"\2\2"  # how rows begin that are coded as since then
 XYZE = "32-bit_rle_xyze"  # Mitsuba takes its white for one of D65, which Radiance's is not
 HEADER_NUMBERS = {  # of a Radiance file: how many, and what
     "EXPOSURE": (1, "a number above 0"),
@@ -206,11 +208,20 @@ def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
             )
         bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
     except (OSError, RuntimeError) as error:
-        reason = str(error).strip().splitlines()[-1]
+        reason = OLD_RUNS if _has_old_runs(path) else str(error).strip().splitlines()[-1]
         raise UnirenderError(
             f"light {path}: not a readable HDR map ({reason}), expected RGBE, PFM or EXR; save it as EXR"
         ) from error
     return _as_its_header_says(np.array(bitmap), path), {}
+
+
+def _has_old_runs(path: Path) -> bool:
+    """Whether a Radiance file repeats pixels by others of 1, 1, 1 and a count."""
+    data = path.read_bytes()
+    header = SIZES.match(data[:MOST_HEADER_BYTES])
+    start = header.end() if header else len(data)
+    pixels = np.frombuffer(data, np.uint8, (len(data) - start) // 4 * 4, start).reshape(-1, 4)[:, :3]
+    return not data.startswith(NEW_RUNS, start) and bool((pixels == 1).all(axis=1).any())
 
 
 def _as_its_header_says(pixels: Float[np.ndarray, "h w 3"], path: Path) -> Float[np.ndarray, "h w 3"]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UsageError
+from unirender.system.machine import memory_excess
 from unirender_reference.optimize.shape.config import ShapeConfig
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from unirender_reference.shapes import MeshObject
 
 HELD_OUT = 8
+BYTES_A_PIXEL = 32  # of memory: RGBA of the render and of the picture
 BRIGHT = 0.9  # linear radiance of the 97th percentile of the object's pixels
 
 
@@ -46,6 +48,8 @@ class ShapeMeasure:
 
         if min(self.views, self.resolution, self.spp, len(self.objects)) < 1:
             raise UsageError("expected at least 1 object, view, pixel and sample")
+        if excess := memory_excess(BYTES_A_PIXEL * self.views * self.resolution**2):
+            raise UsageError(f"--views {self.views}, --resolution {self.resolution}: {excess}; take fewer")
         table = Table("object", "vertices", "stage", "mask IoU", "normal cosine", "chamfer", "seconds", "CPU seconds")
         for seed in self.objects:
             for row in measure(self, seed):

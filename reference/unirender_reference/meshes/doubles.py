@@ -2,7 +2,8 @@
 
 All our surfaces are two-sided, so the second face shows nothing new; which of the two a ray meets is chance, and where
 their normals or materials differ the picture is speckled. Only the first face stays; of a flat quadrangle that two
-pieces have, cut along one diagonal and along the other, the first piece's. (Within a piece both cuts stay.)
+pieces have, cut along one diagonal and along the other, the first piece's. (Within a piece both cuts stay, where the
+file has triangles; its polygons are cut alike, see `polygons`.)
 """
 
 from dataclasses import replace
@@ -19,9 +20,9 @@ FLAT = 1 - 1e-6  # cosine between the halves of a flat quadrangle
 def without_doubles(pieces: list[Piece]) -> tuple[list[Piece], int]:
     """The pieces without faces that cover what earlier ones cover, and how many those were."""
     arrays = {id(piece.vertices): piece.vertices for piece in pieces}  # an OBJ's pieces share one
-    hashed = {key: _hashed(points) for key, points in arrays.items()}
-    keys = np.concatenate([hashed[id(piece.vertices)][piece.faces] for piece in pieces])
-    _, first = np.unique(_together(keys), return_index=True)
+    numbers = {key: hashed(points) for key, points in arrays.items()}
+    keys = np.concatenate([numbers[id(piece.vertices)][piece.faces] for piece in pieces])
+    _, first = np.unique(together(keys), return_index=True)
     kept = np.zeros(len(keys), bool)
     kept[first] = True
     counts = [len(piece.faces) for piece in pieces]
@@ -46,7 +47,7 @@ def _other_cuts(
         owners: the pieces.
     """
     apex, points = keys.reshape(-1), corners.reshape(-1, 3)  # rows: a triangle's corner, and the edge that faces it
-    edge = _together(np.stack([keys[:, [1, 2, 0]], keys[:, [2, 0, 1]]], axis=-1).reshape(-1, 2))
+    edge = together(np.stack([keys[:, [1, 2, 0]], keys[:, [2, 0, 1]]], axis=-1).reshape(-1, 2))
     order = np.argsort(edge, kind="stable")
     _, start, count = np.unique(edge[order], return_index=True, return_counts=True)
     pairs = start[count == 2]
@@ -56,14 +57,14 @@ def _other_cuts(
         here, there = np.cross(q - p, points[one] - p), np.cross(q - p, points[other] - p)
         flat = (here * there).sum(-1) < -FLAT * np.linalg.norm(here, axis=-1) * np.linalg.norm(there, axis=-1)
     one, other = one[flat], other[flat]
-    diagonal, across = edge[one], _together(np.stack([apex[one], apex[other]], axis=-1))
+    diagonal, across = edge[one], together(np.stack([apex[one], apex[other]], axis=-1))
     cut, turned = (_in_turn(np.stack(both, axis=-1)) for both in ((diagonal, across), (across, diagonal)))
     _, a, b = np.intersect1d(cut, turned, return_indices=True)
     later = a[owners[one[a] // 3] > owners[one[b] // 3]]
     return np.concatenate([one[later], other[later]]) // 3
 
 
-def _together(numbers: UInt64[np.ndarray, "n k"]) -> UInt64[np.ndarray, " n"]:
+def together(numbers: UInt64[np.ndarray, "n k"]) -> UInt64[np.ndarray, " n"]:
     """A number for several, whatever their order."""
     return _in_turn(np.sort(numbers, axis=1))
 
@@ -76,7 +77,7 @@ def _in_turn(numbers: UInt64[np.ndarray, "n k"]) -> UInt64[np.ndarray, " n"]:
     return mixed
 
 
-def _hashed(points: Float[np.ndarray, "n 3"]) -> UInt64[np.ndarray, " n"]:
+def hashed(points: Float[np.ndarray, "n 3"]) -> UInt64[np.ndarray, " n"]:
     """A number for each point, the same for equal points."""
     mixed = np.zeros(len(points), np.uint64)
     for column in (points + 0.0).T:  # -0.0 is 0.0

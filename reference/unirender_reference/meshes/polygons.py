@@ -1,11 +1,12 @@
 """Polygons cut into triangles: into fans from their first corner, and where a fan would reach beyond a concave polygon,
-along other diagonals.
+along other diagonals. A polygon that is written twice, once for each side, is cut alike both times.
 """
 
 import mapbox_earcut
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from unirender_reference.meshes.doubles import hashed, together
 from unirender_reference.meshes.limits import check_corners
 
 FOLDED = 1e-3  # triangles turned against their polygon, together more than this share of its area
@@ -30,17 +31,36 @@ def triangulate(
     """
     triangles, polygon = fans(sizes)
     first = np.cumsum(sizes) - sizes
+    begun = _begun_alike(points, sizes)
+    points = points[begun]
     folded = _folded(points, sizes, triangles, polygon)
     check_corners(int(sizes[folded].max(initial=0)))
     cuts = {p: _other_cut(points[first[p] : first[p] + sizes[p]]) for p in folded}
     found = {p: cut + first[p] for p, cut in cuts.items() if cut is not None}
     if not found:
-        return triangles, polygon
+        return begun[triangles], polygon
     kept = ~np.isin(polygon, list(found))
     triangles = np.concatenate([triangles[kept], *found.values()])
     polygon = np.concatenate([polygon[kept], *(np.full(len(cut), p) for p, cut in found.items())])
     order = np.argsort(polygon, kind="stable")
-    return triangles[order], polygon[order]
+    return begun[triangles[order]], polygon[order]
+
+
+def _begun_alike(points: Float[np.ndarray, "k 3"], sizes: Int[np.ndarray, " p"]) -> Int[np.ndarray, " k"]:
+    """The rows of the corners; those of a polygon that has the corners of an earlier one from that one's first on."""
+    first = np.cumsum(sizes) - sizes
+    owner = np.repeat(np.arange(len(sizes)), sizes)
+    numbers, keys = hashed(points), np.zeros(len(sizes), np.uint64)
+    for size in np.unique(sizes):
+        alike = np.flatnonzero(sizes == size)
+        keys[alike] = together(numbers[first[alike, None] + np.arange(size)])
+    _, earliest, which = np.unique(keys, return_index=True, return_inverse=True)
+    begin = np.flatnonzero(numbers == numbers[first[earliest[which]]][owner])
+    again, at = np.unique(owner[begin], return_index=True)
+    shift = np.zeros(len(sizes), np.int64)
+    shift[again] = begin[at] - first[again]
+    step = np.arange(len(points)) - first[owner]
+    return first[owner] + (step + shift[owner]) % sizes[owner]
 
 
 def fans(sizes: Int[np.ndarray, " p"]) -> tuple[Int[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:

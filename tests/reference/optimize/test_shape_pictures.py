@@ -239,5 +239,10 @@ def test_the_measure_scores_every_stage(capsys: pytest.CaptureFixture[str], monk
     assert ShapeMeasure(objects=(5,), views=6, resolution=24, spp=16, shape=shape).run() == 0
     printed = capsys.readouterr().out
     assert all(stage in printed for stage in ("visual hull", "masks", "pictures", "true light"))
+
+
+def test_the_measure_refuses_what_it_cannot_do() -> None:
     with pytest.raises(UsageError, match="at least 1 object"):
         ShapeMeasure(objects=()).run()
+    with pytest.raises(UsageError, match=r"--views 1000000000000, --resolution 64: would take about .*; take fewer"):
+        ShapeMeasure(views=10**12).run()
