@@ -23,7 +23,6 @@ from unirender.exr import exr_bytes, intrinsics_channels
 from unirender.intrinsics import Intrinsics
 from unirender.light.lobes import texel_directions
 from unirender.models.visibility import CLASSES, VisibilityNet, bin_weights
-from unirender.system.ends import SIGNALS
 from unirender.training.loop import checkpoint
 from unirender.training.loop.checkpoint import load_state
 from unirender.training.shadows.command import TrainVisibility, rate, split, train_visibility
