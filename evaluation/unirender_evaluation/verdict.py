@@ -85,14 +85,14 @@ class Finding:
         if self.comparison is None:
             return f"{self.why}{self.number}: {c.a} against {c.b}"
         d = self.comparison.difference
-        unit = c.kind.unit
         remark = f"; {c.remark}" if c.remark else ""
-        interval = f"[{d.low:+.4g}, {d.high:+.4g}] " if self.comparison.decided else ""
+        interval = f"[{d.low:+.4g}, {d.high:+.4g}]" if self.comparison.decided else ""
+        difference = " ".join(filter(None, (f"{d.mean:+.4g}", interval, c.kind.unit)))
         objects = f"{d.clusters} object{'s' * (d.clusters != 1)}"
         n = f"{d.n} of {self.asked}" if d.n < self.asked else f"{d.n}"
         return (
             f"{self.word:7s}{self.number}: {c.a} {self.comparison.verdict} {c.b}, "
-            f"difference {d.mean:+.4g} {interval}{unit} (n {n}, {objects}{remark}){self._other_lights_text()}"
+            f"difference {difference} (n {n}, {objects}{remark}){self._other_lights_text()}"
         )
 
     def _other_lights_text(self) -> str:
