@@ -98,7 +98,7 @@ def test_an_option_is_known_however_wide_the_terminal_is(
 ) -> None:
     """A wide one gets several columns of options, of which those of the first were known."""
     monkeypatch.setenv("COLUMNS", str(columns))
-    told = said(capsys, "optimize", "x", "--out", "y", "--refine.no-common-random-numbers", "--single.steps", "no")[1]
+    told = said(capsys, "optimize", "x", "--out", "y", "--refine.no-decorrelated", "--single.steps", "no")[1]
     assert "no option of" not in told
     assert "--single.steps" in told
 
