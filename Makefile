@@ -70,7 +70,7 @@ style: $(VENV)/.dev
 
 # With node's own 4 GB it throws away, three quarters through, what it has inferred, and infers it again.
 types: $(VENV)/.dev
-	NODE_OPTIONS=--max-old-space-size=6144 $(BIN)/pyright
+	NODE_OPTIONS="--max-old-space-size=6144 $$NODE_OPTIONS" $(BIN)/pyright
 
 # Type checks use one core for minutes; the documentation, and then the tests, have the others.
 test: style

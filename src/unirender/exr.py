@@ -181,8 +181,8 @@ def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[
     except UnirenderError:
         raise
     except Exception as error:  # the binding raises several types for broken data
-        kind = "a damaged or a mip-mapped one" if data.startswith(SIGNATURE) else "another" if data else "empty"
-        message = f"{name}: not a readable OpenEXR file, but {kind}; write it again, as scan lines"
+        kind = "damaged or mip-mapped" if data.startswith(SIGNATURE) else "of another kind" if data else "empty"
+        message = f"{name}: not a readable OpenEXR file: it is {kind}; write it again, as scan lines"
         raise UnirenderError(message) from error
     if parts != 1:
         raise UnirenderError(f"{name}: got {parts} parts, expected a single-part file; split it first")

@@ -232,6 +232,17 @@ def test_both_sides_of_a_polygon_are_one_whichever_corner_they_begin_with(tmp_pa
     assert len(other.faces) > 3
 
 
+@pytest.mark.parametrize("start", range(8))
+def test_both_sides_of_a_concave_polygon_are_one(tmp_path, start):
+    """A U, whose cut the corner decides that it begins with."""
+    corners = "".join(f"v {x} {y} 0\n" for x, y in ((0, 0), (3, 0), (3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3)))
+    one = " ".join(str((start + k) % 8 + 1) for k in range(8))
+    for begin in range(8):
+        back = " ".join(str((begin - k) % 8 + 1) for k in range(8))
+        obj = write(tmp_path, "Kd 1 1 1", f"f {one}\nf {back}", corners)
+        assert (len(obj.faces), obj.provenance["double_faces"]) == (6, "6")
+
+
 def test_maps_that_say_how_a_surface_shines_are_listed(tmp_path):
     """What Blender writes roughness and metallic into without its PBR keywords, and packed maps by their own name."""
     maps = "map_Ks s.png\nmap_Ns n.png\nrefl -type sphere r.png\nmap_RMA p.png\nmap_Ka a.png\nmap_aat on"

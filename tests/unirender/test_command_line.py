@@ -92,6 +92,16 @@ def test_what_a_command_does_not_take(arguments: list[str], line: str, capsys: p
     assert said(capsys, *arguments) == (2, f"unirender: error: {line}\n")
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [["bench", "verdict", "results", "--format", "html"], ["reference", "exposure", "x", "--split", "tset"]],
+)
+def test_a_value_is_not_taken_for_a_command(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """The choices of an option stand in braces, too."""
+    status, told = said(capsys, *arguments)
+    assert (status, "no command of" in told, arguments[-1] in told) == (2, False, True)
+
+
 @pytest.mark.parametrize("columns", [40, 80, 250])
 def test_an_option_is_known_however_wide_the_terminal_is(
     columns: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

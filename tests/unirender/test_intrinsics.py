@@ -99,14 +99,16 @@ def test_half_precision_refuses_what_it_cannot_hold() -> None:
 
 def test_broken_and_multipart_files_give_one_line(tmp_path: Path) -> None:
     (tmp_path / "text.exr").write_text("not an image")
-    with pytest.raises(UnirenderError, match=r"text\.exr: not a readable OpenEXR file, but another; write it again"):
+    with pytest.raises(
+        UnirenderError, match=r"text\.exr: not a readable OpenEXR file: it is of another kind; write it again"
+    ):
         read_exr(tmp_path / "text.exr")
-    with pytest.raises(UnirenderError, match=r"a\.exr: not a readable OpenEXR file, but empty; write it again"):
+    with pytest.raises(UnirenderError, match=r"a\.exr: not a readable OpenEXR file: it is empty; write it again"):
         read_exr_bytes(b"", "a.exr")
     with pytest.raises(UnirenderError, match="cannot be read"):
         read_exr(tmp_path / "missing.exr")
     data = exr_bytes({"R": np.zeros((64, 64))})
-    with pytest.raises(UnirenderError, match="not a readable OpenEXR file, but a damaged or a mip-mapped one; write"):
+    with pytest.raises(UnirenderError, match="not a readable OpenEXR file: it is damaged or mip-mapped; write"):
         read_exr_bytes(data[: len(data) // 2])
     parts = [OpenEXR.Part({}, {"Z": np.zeros((4, 4), "f")}, "a"), OpenEXR.Part({}, {"Z": np.zeros((4, 4), "f")}, "b")]
     OpenEXR.File(parts).write(str(tmp_path / "two.exr"))

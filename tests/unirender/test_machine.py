@@ -70,6 +70,7 @@ def test_too_much_memory_is_told_with_numbers_that_differ(machine: Path) -> None
     )
     (machine / "cgroup").unlink()
     assert memory_excess(8000 * GIB + 1) == "would take about 8,001 GiB of memory, and this machine has 8 GiB for it"
+    assert str(memory_excess(GIB * 10**400)).startswith("would take about 10,000,000"), "beyond floats"
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ from unirender.blocks import by_rows
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, image_channels, on_pole_grid, pixel_count, read_exr
-from unirender.light.environment import check_shape, is_whole_sphere, resample_environment
+from unirender.light.environment import check_shape, is_twice_as_wide, resample_environment
 from unirender.picture_files import display_files
 from unirender.picture_files.primaries import REC709, in_rec709
 from unirender.pictures import check_finite, negative_share
@@ -104,7 +104,7 @@ def load_light(
         environment = photograph_environment(pixels, shape or PHOTOGRAPH_SHAPE)
     else:
         h, w = pixels.shape[:2]
-        if not is_whole_sphere(h, w):
+        if not is_twice_as_wide(h, w):
             raise UnirenderError(
                 f"light {path}: got {w}x{h}, expected a lat-long map twice as wide as high; unwrap a light probe "
                 "first; an ordinary photograph is a PNG or JPG file (in Python also any other, with photograph=True)"

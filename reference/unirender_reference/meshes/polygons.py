@@ -31,11 +31,15 @@ def triangulate(
     """
     triangles, polygon = fans(sizes)
     first = np.cumsum(sizes) - sizes
-    begun = _begun_alike(points, sizes)
+    earliest, begun = _begun_alike(points, sizes)
     points = points[begun]
     folded = _folded(points, sizes, triangles, polygon)
     check_corners(int(sizes[folded].max(initial=0)))
-    cuts = {p: _other_cut(points[first[p] : first[p] + sizes[p]]) for p in folded}
+    cuts: dict[int, Int[np.ndarray, "m 3"] | None] = {}
+    for p in folded:
+        ring, before = (points[first[q] : first[q] + sizes[q]] for q in (p, earliest[p]))
+        turned_over = earliest[p] in cuts and np.array_equal(ring[1:], before[:0:-1])
+        cuts[p] = _turned_over(cuts[earliest[p]], len(ring)) if turned_over else _other_cut(ring)
     found = {p: cut + first[p] for p, cut in cuts.items() if cut is not None}
     if not found:
         return begun[triangles], polygon
@@ -46,8 +50,15 @@ def triangulate(
     return begun[triangles[order]], polygon[order]
 
 
-def _begun_alike(points: Float[np.ndarray, "k 3"], sizes: Int[np.ndarray, " p"]) -> Int[np.ndarray, " k"]:
-    """The rows of the corners; those of a polygon that has the corners of an earlier one from that one's first on."""
+def _turned_over(cut: Int[np.ndarray, "m 3"] | None, corners: int) -> Int[np.ndarray, "m 3"] | None:
+    """The same triangles of the polygon that begins at the same corner and goes round the other way."""
+    return None if cut is None else -cut[:, ::-1] % corners
+
+
+def _begun_alike(
+    points: Float[np.ndarray, "k 3"], sizes: Int[np.ndarray, " p"]
+) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " k"]]:
+    """Of each polygon the first that has its corners, and the rows of its corners from that one's first on."""
     first = np.cumsum(sizes) - sizes
     owner = np.repeat(np.arange(len(sizes)), sizes)
     numbers, keys = hashed(points), np.zeros(len(sizes), np.uint64)
@@ -60,7 +71,7 @@ def _begun_alike(points: Float[np.ndarray, "k 3"], sizes: Int[np.ndarray, " p"])
     shift = np.zeros(len(sizes), np.int64)
     shift[again] = begin[at] - first[again]
     step = np.arange(len(points)) - first[owner]
-    return first[owner] + (step + shift[owner]) % sizes[owner]
+    return earliest[which], first[owner] + (step + shift[owner]) % sizes[owner]
 
 
 def fans(sizes: Int[np.ndarray, " p"]) -> tuple[Int[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:

@@ -41,7 +41,8 @@ def number(asked: PrimitiveTypeInfo) -> Spec:
 
 @registry.primitive_rule
 def optional(asked: PrimitiveTypeInfo) -> Spec:
-    """A value or None. The word None is taken, since an option may have another default, but not offered."""
+    """A value or None. The word None is taken, since an option may have another default, but not offered;
+    of a choice it is not taken."""
     kinds = [kind for kind in get_args(asked.type) if kind is not type(None)]
     if len(kinds) != 1 or type(None) not in get_args(asked.type):
         return None

@@ -17,7 +17,7 @@ from unirender.system.ends import causes
 
 OPTION = re.compile(r"(?<![\w.-])--[a-z][\w.-]*")
 SYNONYMS = {"size": "resolution", "resolution": "size", "light": "environment", "model": "checkpoint"}
-COMMANDS = re.compile(r"\{([\w,-]+)\}")  # of a usage line
+COMMANDS = re.compile(r"\[-h\] \{([\w,-]+)\}$")  # of a usage line; not the choices of an option
 BORDER = "\N{BOX DRAWINGS LIGHT VERTICAL}"  # of the boxes of a help, where a stream can print it
 LINE_BREAK = re.compile(r"(?<!\n)\n[ ]*(?![ \n]|- )")  # of a sentence: no empty line, no item of a list
 

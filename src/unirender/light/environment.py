@@ -53,10 +53,9 @@ def as_light(environment: Any) -> Float[np.ndarray, "h w 3"]:
     return light
 
 
-def is_whole_sphere(height: int, width: int) -> bool:
-    """Whether a map of that size is a lat-long map by its shape: twice as wide as high, or, on the grid whose first and
-    last row are the poles, with equal steps both ways."""
-    return height >= 2 and (abs(width / height - 2) <= ASPECT_TOLERANCE or width == 2 * (height - 1))
+def is_twice_as_wide(height: int, width: int) -> bool:
+    """Whether a map of that size is a lat-long map by its shape."""
+    return height >= 2 and abs(width / height - 2) <= ASPECT_TOLERANCE
 
 
 def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:

@@ -12,7 +12,7 @@ from PIL import Image
 from unirender.arguments import as_instance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import RANGE_TOLERANCE, Intrinsics, as_numbers
-from unirender.light.environment import as_light, is_whole_sphere
+from unirender.light.environment import as_light, is_twice_as_wide
 from unirender.picture_files.display_files import display_colors, display_values, is_turned
 from unirender.pictures import coverage
 from unirender.pipelines.bounced_light import WHITE_SKY, bounced_light
@@ -133,10 +133,11 @@ def check_sphere(environment: Float[np.ndarray, "*n eh ew 3"]) -> None:
     """Looks at the shape of a light.
 
     Raises:
-        UnirenderError: it is not twice as wide as high, as a light probe or a photograph.
+        UnirenderError: it is not twice as wide as high, nor, with its first and last row at the poles, has equal steps
+            both ways; a light probe or a photograph, say.
     """
     height, width = environment.shape[-3:-1]
-    if not is_whole_sphere(height, width):
+    if not is_twice_as_wide(height, width) and width != 2 * (height - 1):
         raise UnirenderError(
             f"environment: got {width}x{height}, expected a lat-long map twice as wide as high; unwrap a light probe "
             "first; of a photograph's file unirender_reference.lights.load_light(path, photograph=True) makes one"

@@ -60,11 +60,9 @@ def needs_swap(wanted: float) -> str | None:
 
 def _gibibytes(wanted: float, present: float) -> tuple[str, str]:
     """Both as text, the first rounded up and the second down."""
-    digits = int(wanted < 100 * GIB)
-    parts = 10**digits
-    rounded = math.ceil(wanted * parts / GIB) / parts, math.floor(present * parts / GIB) / parts
-    needed, there = (f"{number:,.{digits}f}" for number in rounded)
-    return needed, there
+    if wanted >= 100 * GIB:
+        return f"{int(-(-wanted // GIB)):,}", f"{present // GIB:,.0f}"
+    return f"{-(-wanted * 10 // GIB) / 10:.1f}", f"{present * 10 // GIB / 10:.1f}"
 
 
 def _allowed_bytes(swap: float) -> float:

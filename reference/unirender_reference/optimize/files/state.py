@@ -29,6 +29,7 @@ from unirender_reference.optimize.views import Step, View, Views
 from unirender_reference.shapes import MeshObject
 
 HISTORY, STATE, RUN, PROGRESS = "history.jsonl", "state", "run.json", "progress.json"
+SHOWN = 8  # options in a sentence
 
 
 @dataclass
@@ -166,10 +167,10 @@ def _check_same(out: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) 
     there, here = _flat(found), _flat(wanted)
     differs = [key for key in sorted({*there, *here}) if there.get(key) != here.get(key)]
     if differs:
-        shown = ", ".join(differs[:5])
+        shown = ", ".join(differs[:SHOWN]) + (f" and {len(differs) - SHOWN} more" if len(differs) > SHOWN else "")
         raise UnirenderError(
-            f"{out}: holds a run with other {shown}; expected the same, to go on with it: choose another --out, or "
-            "delete it"
+            f"{out}: holds a run with other {shown}; a run goes on with the same pictures, options and version alone: "
+            "choose another --out, or delete it"
         )
 
 
