@@ -15,8 +15,8 @@ QUANTITIES = {
     "specular": "s",
     "diffuse": "d",
     "environment": "light",
-    "edit_metallic": "another metallic",
-    "edit_roughness": "another roughness",
+    "edit_metallic": "edits of metallic",
+    "edit_roughness": "edits of roughness",
     "relit": "relit",
 }
 TRUE: tuple[tuple[str, str, Callable[[float], bool]], ...] = (  # of maps, which have no noise ceiling
