@@ -165,8 +165,8 @@ def as_numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
     """
     try:
         given = np.asarray(value)
-        if given.dtype.kind == "c":
-            raise TypeError("complex")
+        if given.dtype.kind in "cUS":
+            raise TypeError("complex numbers, or text")
         return np.asarray(given, dtype=np.float32)
     except (TypeError, ValueError, RuntimeError) as error:  # the last is torch's
         if type(value).__module__ == "torch":

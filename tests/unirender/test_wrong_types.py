@@ -82,6 +82,7 @@ CASES = {
     "pipeline.edit(image, mask, roughness=[0.2, 0.3])": "roughness: got shape (2,), expected one number",
     "pipeline.edit(image, mask, metallic=np.zeros(0))": "metallic: got shape (0,), expected one number",
     "pipeline.edit(image, mask, metallic='gold')": "metallic: got str 'gold', expected numbers",
+    "pipeline.edit(image, mask, metallic='0.2')": "metallic: got str '0.2', expected numbers",
     "pipeline.render(decomposition)": "render: got Decomposition, expected unirender.intrinsics.Intrinsics; it has one",
     "export_scene(maps, 'scene')": "folder: got Intrinsics Intrinsics(albedo",
     "export_scene('not_made', None)": "export: got NoneType, expected unirender.intrinsics.Intrinsics; are arguments",

@@ -128,7 +128,10 @@ def test_a_result_that_was_not_finished_is_written_again(whole: Path, tmp_path: 
     ("change", "named"),
     [
         ({"config": dataclasses.replace(CONFIG, seed=1)}, "config.seed"),
-        ({"config": dataclasses.replace(CONFIG, refine=dataclasses.replace(REFINE, spp=8))}, r"config\.refine\.spp;"),
+        (
+            {"config": dataclasses.replace(CONFIG, refine=dataclasses.replace(REFINE, spp=8))},
+            r"config\.refine\.spp \(4, now 8\);",
+        ),
         ({"init": flat_start(truth().obj, 17)}, "inputs.start"),
     ],
 )
@@ -142,8 +145,8 @@ def test_a_run_with_an_option_that_is_gone_is_refused(tmp_path: Path):
     now = {"config": {"refine": {"spp": 4}}, "inputs": {}, "versions": {}}
     with open_run(tmp_path, {**now, "config": {"refine": {"spp": 4, "demodulated": 0.0}}}):
         pass
-    refused = pytest.raises(UnirenderError, match=r"holds a run with other config\.refine\.demodulated; a run goes on")
-    with refused, open_run(tmp_path, now):
+    named = r"holds a run with other config\.refine\.demodulated \(0\.0, now None\); a run goes"
+    with pytest.raises(UnirenderError, match=named), open_run(tmp_path, now):
         pass
 
 

@@ -167,7 +167,8 @@ def _check_same(out: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) 
     there, here = _flat(found), _flat(wanted)
     differs = [key for key in sorted({*there, *here}) if there.get(key) != here.get(key)]
     if differs:
-        shown = ", ".join(differs[:SHOWN]) + (f" and {len(differs) - SHOWN} more" if len(differs) > SHOWN else "")
+        shown = ", ".join(f"{key} ({there.get(key)!r:.20}, now {here.get(key)!r:.20})" for key in differs[:SHOWN])
+        shown += f" and {len(differs) - SHOWN} more" if len(differs) > SHOWN else ""
         raise UnirenderError(
             f"{out}: holds a run with other {shown}; a run goes on with the same pictures, options and version alone: "
             "choose another --out, or delete it"
