@@ -36,10 +36,10 @@ def triangulate(
     folded = _folded(points, sizes, triangles, polygon)
     check_corners(int(sizes[folded].max(initial=0)))
     cuts: dict[int, Int[np.ndarray, "m 3"] | None] = {}
-    for p in folded:
-        ring, before = (points[first[q] : first[q] + sizes[q]] for q in (p, earliest[p]))
-        turned_over = earliest[p] in cuts and np.array_equal(ring[1:], before[:0:-1])
-        cuts[p] = _turned_over(cuts[earliest[p]], len(ring)) if turned_over else _other_cut(ring)
+    for p, q in zip(folded.tolist(), earliest[folded].tolist(), strict=True):
+        ring, before = (points[first[own] : first[own] + sizes[own]] for own in (p, q))
+        turned_over = q in cuts and np.array_equal(ring[1:], before[:0:-1])
+        cuts[p] = _turned_over(cuts[q], len(ring)) if turned_over else _other_cut(ring)
     found = {p: cut + first[p] for p, cut in cuts.items() if cut is not None}
     if not found:
         return begun[triangles], polygon
