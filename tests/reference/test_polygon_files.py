@@ -156,6 +156,21 @@ def test_texture_coordinates_go_with_the_corners(tmp_path, form, of_vertices):
     assert load_mesh(path).albedo.reshape(-1, 3)[0].tolist() == [1.0, 0.0, 0.0]
 
 
+def test_normals_go_with_the_corners_beside_their_coordinates(tmp_path):
+    """Where the faces had coordinates of their own, normals of the vertices were lost."""
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
+    kinds, normals = [*POINT, ("float", "nx"), ("float", "ny"), ("float", "nz")], np.arange(15.0).reshape(5, 3) + 1
+    faces = [*faces_of()[1], ("uchar", "float", "texcoord")]
+    rows = [[face, np.arange(2 * len(face)) / 10] for face in (QUAD, TRIANGLE)]
+    points = np.hstack([FLAT, normals]).tolist()
+    (path := tmp_path / "a.ply").write_bytes(
+        ply("ascii", [("vertex", kinds, points), ("face", faces, rows)], "TextureFile a.png")
+    )
+    (piece,) = read_model(path).pieces
+    assert piece.uv
+    np.testing.assert_array_equal(piece.normals, normals[piece.faces])
+
+
 def test_a_texture_without_coordinates_counts_as_its_mean_and_is_listed(tmp_path):
     """The object was grey, and nothing said so."""
     Image.new("RGB", (4, 4), (255, 0, 255)).save(tmp_path / "a.png")

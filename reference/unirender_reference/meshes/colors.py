@@ -7,6 +7,8 @@ where all are whole and one is above 1, or one is above `MOST_FLOAT`; else of 1,
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from unirender.color import srgb_decode
+
 MOST_FLOAT = 2.0  # of colours that are floats of 1
 OPAQUE = 0.998  # what alpha is above if it means 1: less than half a step of 255 below
 
@@ -31,3 +33,8 @@ def unit_colors(stored: Shaped[np.ndarray, "n c"]) -> Float[np.ndarray, "n 3"]:
 def is_opaque(alpha: Shaped[np.ndarray, " n"]) -> bool:
     """Whether each alpha, stored as colours are, is 1."""
     return bool((unit_colors(alpha[:, None].repeat(3, axis=1)) > OPAQUE).all())
+
+
+def linear_colors(stored: Shaped[np.ndarray, "n c"]) -> Float[np.ndarray, "n 3"]:
+    """Linear colours of what `unit_colors` takes."""
+    return srgb_decode(unit_colors(stored).astype(np.float32)).astype(np.float64)

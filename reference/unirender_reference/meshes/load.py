@@ -22,14 +22,23 @@ from unirender_reference.meshes.gltf_scene import read_gltf
 from unirender_reference.meshes.limits import check_geometry
 from unirender_reference.meshes.normals import piece_normals
 from unirender_reference.meshes.obj import read_obj
+from unirender_reference.meshes.off import read_off
+from unirender_reference.meshes.ply import read_ply
+from unirender_reference.meshes.stl import read_stl
 from unirender_reference.meshes.surface import Material, Model, Piece
 from unirender_reference.meshes.tiles import Patch
-from unirender_reference.meshes.trimesh_files import read_through_trimesh
 from unirender_reference.shapes import MeshObject, Sphere, bounding_sphere
 from unirender_reference.shapes.surface import split_corners
 
 SMALLER = "sharpness of smaller textures"  # among what is ignored
-READERS = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj}
+READERS = {
+    ".glb": read_gltf,
+    ".gltf": read_gltf,
+    ".obj": read_obj,
+    ".ply": read_ply,
+    ".stl": lambda path, folder: read_stl(path),
+    ".off": lambda path, folder: read_off(path),
+}
 
 
 def load_mesh(path: str | Path, root: Path | None = None) -> MeshObject:
@@ -76,7 +85,7 @@ def _read(path: Path, root: Path | None) -> Model:
         raise UnirenderError(f"got suffix {path.suffix!r}, expected one of {', '.join(SUFFIXES)}; {advice}")
     if path.stat().st_size == 0:
         raise UnirenderError("is empty; copy it again")
-    model = READERS.get(path.suffix.lower(), read_through_trimesh)(path, ModelFolder(path, root))
+    model = READERS[path.suffix.lower()](path, ModelFolder(path, root))
     pieces = [piece for piece in model.pieces if len(piece.faces)]
     if not pieces:
         raise UnirenderError("has no faces, expected a triangle mesh; is it a point cloud?")

@@ -1,4 +1,4 @@
-"""What trimesh leaves out of an OFF file: whether it is whole, its normals (NOFF), its colours and concave polygons.
+"""OFF files as text: points, polygons, normals (NOFF) and colours.
 
 Behind the three coordinates of a vertex stand its normal (N), its colour (C) and its texture coordinates (ST), as far
 as the header's letters name them; behind the indices of a face may stand a colour. Colours are three or four numbers,
@@ -6,64 +6,33 @@ sRGB-coded, of 255 or of 1 (`colors`); the fourth is alpha. A single number behi
 that the file does not hold.
 """
 
-import io
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
-from unirender_reference.meshes.colors import is_opaque, unit_colors
-from unirender_reference.meshes.limits import MAX_VERTICES, check_faces
+from unirender_reference.meshes.colors import is_opaque, linear_colors
+from unirender_reference.meshes.limits import MAX_VERTICES, check_bytes, check_faces
+from unirender_reference.meshes.mtl import DEFAULT_ALBEDO
 from unirender_reference.meshes.polygons import triangulate
+from unirender_reference.meshes.surface import Material, Model, Piece
 
 LETTERS = "CNST"
 
 
-@dataclass(frozen=True)
-class OffLines:
-    """Normals and linear colours of a mesh, as far as it has them.
+def read_off(path: Path) -> Model:
+    """Reads an OFF file.
 
-    Attributes:
-        normals: (n, 3) of the vertices, as they are stored, or None.
-        vertices: (n, 3) colours of the vertices, or None.
-        faces: (m, 3) colours of the triangles, or None.
-        ignored: "colours" where the file has some, or numbers in their place, that are not read; "alpha".
-        triangles: the file with triangles for its polygons; None where it has triangles alone.
-    """
-
-    normals: Float[np.ndarray, "n 3"] | None = None
-    vertices: Float[np.ndarray, "n 3"] | None = None
-    faces: Float[np.ndarray, "m 3"] | None = None
-    ignored: frozenset[str] = frozenset()
-    triangles: io.BytesIO | None = None
-
-    @property
-    def colored(self) -> bool:
-        """Whether the mesh has colours."""
-        return self.vertices is not None or self.faces is not None
-
-    def corners(self, faces: Int[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3 3"]:
-        """The colours of each corner; vertices come before faces."""
-        if self.vertices is not None:
-            return self.vertices[faces]
-        assert self.faces is not None
-        return np.repeat(self.faces[:, None], 3, axis=1)
-
-
-def read_off_lines(path: Path) -> OffLines:
-    """Normals, colours and triangles of a file.
-
-    Where some vertices or faces have no colour, or words stand in its place, colours are left out. Faces of one or two
-    corners are, too.
+    Colours of vertices come before those of faces. Where some have no colour, or words stand in its place, colours are
+    left out. Faces of one or two corners are, too.
 
     Raises:
         UnirenderError: another header than OFF with the letters C, N and ST; counts, points or indices that are none;
-            fewer lines, or numbers on them, than claimed.
+            fewer lines, or numbers on them, than claimed; or a limit is exceeded.
     """
+    check_bytes(path.stat().st_size, "the file")
     text = re.sub(r"#[^\n]*", "", path.read_text("utf-8-sig", "replace"))
     letters, found, body = text.partition("OFF")
     letters = letters.strip()
@@ -77,16 +46,19 @@ def read_off_lines(path: Path) -> OffLines:
     end = -2 if "ST" in letters else None
     lines = [line.split() for line in body.splitlines() if line.strip()]
     of_vertices, of_faces = _rows(lines, start - (end or 0))
-    polygon, triangles = _triangles(of_vertices, [line[1 : int(line[0]) + 1] for line in of_faces])
+    points, faces, polygon = _triangles(of_vertices, [line[1 : int(line[0]) + 1] for line in of_faces])
     vertex_colors = [line[start:end] for line in of_vertices]
     face_colors = [of_faces[k][int(of_faces[k][0]) + 1 :] for k in polygon]
     of_each_vertex, vertices_opaque = _linear(vertex_colors if "C" in letters else [])
     of_each_face, faces_opaque = _linear(face_colors if of_each_vertex is None else [])
     unread = (any(vertex_colors) and of_each_vertex is None) or (any(face_colors) and of_each_face is None)
     ignored = {"colours": unread, "alpha": not (vertices_opaque and faces_opaque)}
-    normals = np.array([line[3:6] for line in of_vertices], np.float64) if "N" in letters else None
-    names = frozenset(name for name, is_so in ignored.items() if is_so)
-    return OffLines(normals, of_each_vertex, of_each_face, names, triangles)
+    normals = np.array([line[3:6] for line in of_vertices], np.float64)[faces] if "N" in letters else None
+    colors = None if of_each_face is None else np.repeat(of_each_face[:, None], 3, axis=1)
+    colors = colors if of_each_vertex is None else of_each_vertex[faces]
+    material = Material({"albedo": np.full(3, DEFAULT_ALBEDO if colors is None else 1, np.float32)})
+    piece = Piece(points, faces, normals, {}, colors, material)
+    return Model([piece], frozenset(name for name, is_so in ignored.items() if is_so))
 
 
 def _rows(lines: list[list[str]], width: int) -> tuple[list[list[str]], list[list[str]]]:
@@ -115,8 +87,10 @@ def _rows(lines: list[list[str]], width: int) -> tuple[list[list[str]], list[lis
     return of_vertices, of_faces
 
 
-def _triangles(vertices: list[list[str]], corners: list[list[str]]) -> tuple[Int[np.ndarray, " m"], io.BytesIO | None]:
-    """The polygon of each triangle, and a file of the triangles where not all polygons are some."""
+def _triangles(
+    vertices: list[list[str]], corners: list[list[str]]
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"], Int[np.ndarray, " m"]]:
+    """The points, the triangles, and the polygon of each."""
     rows = np.array([k for k, face in enumerate(corners) if len(face) > 2], np.int64)
     sizes = np.array([len(corners[k]) for k in rows], np.int64)
     check_faces(int((sizes - 2).sum()))
@@ -128,12 +102,8 @@ def _triangles(vertices: list[list[str]], corners: list[list[str]]) -> tuple[Int
     if len(index) and (index.min() < 0 or index.max() >= len(points)):
         wrong = index.min() if index.min() < 0 else index.max()
         raise UnirenderError(f"its faces name vertex {wrong:,}, but it has {len(points):,} vertices; export it again")
-    if (sizes == 3).all() and len(rows) == len(corners):
-        return rows, None
     triangles, polygon = triangulate(points[index], sizes)
-    lines = [f"OFF {len(vertices)} {len(triangles)} 0", *(" ".join(line[:3]) for line in vertices)]
-    lines += [f"3 {a} {b} {c}" for a, b, c in index[triangles].tolist()]
-    return rows[polygon], io.BytesIO("\n".join(lines).encode())
+    return points, index[triangles], rows[polygon]
 
 
 def _linear(numbers: list[list[str]]) -> tuple[Float[np.ndarray, "n 3"] | None, bool]:
@@ -148,4 +118,4 @@ def _linear(numbers: list[list[str]]) -> tuple[Float[np.ndarray, "n 3"] | None, 
     opaque = not have_alpha or is_opaque(stored[:, 3])
     if (stored % 1).any():
         stored = stored[:, :3]  # of floats, alpha may be of another range
-    return srgb_decode(unit_colors(stored).astype(np.float32)).astype(np.float64), opaque
+    return linear_colors(stored), opaque
