@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from unirender.errors import UnirenderError
-from unirender_reference.shards import JOURNAL, ShardRecord, write_manifest
+from unirender.system.writing import writing
+from unirender_reference.shards import JOURNAL, TO_DO, ShardRecord, write_manifest
 
 SECONDS = 30.0
 
@@ -52,15 +53,10 @@ class Journal:
             self._write(complete=False)
             return
         path = self._folder / JOURNAL
-        try:
-            with path.open("a") as stream:
-                stream.write(json.dumps(record.entry()) + "\n")
-                stream.flush()
-                os.fsync(stream.fileno())
-        except OSError as error:
-            raise UnirenderError(
-                f"{path}: cannot be written ({error.strerror}); free some space or choose another --out"
-            ) from error
+        with writing(path, TO_DO), path.open("a") as stream:
+            stream.write(json.dumps(record.entry()) + "\n")
+            stream.flush()
+            os.fsync(stream.fileno())
 
     def __enter__(self) -> "Journal":
         return self

@@ -11,6 +11,7 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.system.whole_files import aside, replace_file
+from unirender.system.writing import writing
 from unirender_reference.dataset_sides import MIXES, check_sides
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 from unirender_reference.mesh_folder import MeshFile, files_hash, mesh_folder
@@ -208,19 +209,15 @@ def _write(folder: Path, drawn: _Drawn, seed: int, number: int) -> None:
     borrowed = {id(picture.texels) for picture in pictures}
     if any(id(texture.texels) in borrowed for texture in pictures_of(mix)):
         header.append(f"with a picture of {_named(drawn.files[donor])}")
+    temporary = aside(folder, "partial")
     try:
-        temporary = aside(folder, "partial")
-        try:
+        with writing(folder):
             temporary.mkdir()
             write_obj(mix, temporary, folder.name, header)
             temporary.rename(folder)
-        except BaseException:
-            shutil.rmtree(temporary, ignore_errors=True)
-            raise
-    except OSError as error:
-        raise UnirenderError(
-            f"{folder}: cannot be written ({error.strerror or error}); mend that and run the same command again"
-        ) from error
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
 
 
 def _named(file: MeshFile) -> str:

@@ -9,7 +9,6 @@ written). A shard of mesh files lists those that failed, and a hash of the names
 import hashlib
 import io
 import json
-import os
 import tarfile
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -18,12 +17,14 @@ from pathlib import Path
 from typing import IO, Any
 
 from unirender.errors import UnirenderError
-from unirender.system.whole_files import aside, file_sha256
+from unirender.system.whole_files import file_sha256, whole_file
+from unirender.system.writing import writing
 
 MANIFEST = "manifest.json"
 FAILURES = "failures.jsonl"
 JOURNAL = "shards.jsonl"
 FORMAT = 1
+TO_DO = "free some space or choose another --out"  # where a file cannot be written
 OPTIONAL = ("sources", "failures", "floor", "negative_pixels", "unreadable_lights")
 
 
@@ -142,23 +143,11 @@ def write_shard(path: Path, groups: Iterable[tuple[str, Mapping[str, bytes]]]) -
         UnirenderError: a key has a dot (WebDataset cuts there: groups would merge) or occurs twice, or the disk fails.
     """
     try:
-        temporary = aside(path, "part")
-        try:
-            with temporary.open("xb") as stream:
-                _write_tar(stream, path, groups)
-                stream.flush()
-                os.fsync(stream.fileno())
-            sha256 = file_sha256(temporary)
-            os.replace(temporary, path)
-            _sync_folder(path.parent)
-        except BaseException:
-            temporary.unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise UnirenderError(
-            f"{path}: cannot be written ({error.strerror}); free some space or choose another --out"
-        ) from error
-    return sha256
+        with whole_file(path) as stream:
+            _write_tar(stream, path, groups)
+    except OSError as error:  # not `writing`: the groups are rendered in between
+        raise UnirenderError(f"{path}: cannot be written ({error.strerror}); {TO_DO}") from error
+    return file_sha256(path)
 
 
 def _write_tar(stream: IO[bytes], path: Path, groups: Iterable[tuple[str, Mapping[str, bytes]]]) -> None:
@@ -218,27 +207,5 @@ def all_failures(records: Iterable[ShardRecord]) -> list[Failure]:
 
 
 def _replace(path: Path, data: bytes) -> None:
-    """Writes a file under another name, flushes it to the disk and moves it into place."""
-    temporary = path.parent / f".{path.name}.{os.getpid()}.part"
-    try:
-        with temporary.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise UnirenderError(
-            f"{path}: cannot be written ({error.strerror}); free some space or choose another --out"
-        ) from error
-
-
-def _sync_folder(folder: Path) -> None:
-    if not hasattr(os, "O_DIRECTORY"):  # Windows opens no folders
-        return
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    with writing(path, TO_DO), whole_file(path) as stream:
+        stream.write(data)
