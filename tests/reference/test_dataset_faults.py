@@ -207,7 +207,7 @@ def test_a_folder_that_cannot_be_listed_is_a_failure(
 
     def scandir(path: Path) -> Any:  # the tests may run as root, whom no permission stops
         if Path(path) == closed:
-            raise PermissionError(errno.EACCES, "Permission denied")
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
         return genuine(path)
 
     monkeypatch.setattr(os, "scandir", scandir)

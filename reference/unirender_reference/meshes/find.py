@@ -46,7 +46,7 @@ def find_meshes(pattern: str | Path, unreadable: Callable[[Path, str], None] | N
     missed: list[tuple[Path, str]] = []
     report = unreadable or (lambda folder, reason: missed.append((folder, reason)))
     if os.path.isdir(text):
-        found = _walk(Path(text), (), lambda parts: True, lambda parts: True, report)
+        found = _walk(Path(text), lambda parts: True, lambda parts: True, report)
     elif os.path.exists(text):
         found = iter([Path(text)] if Path(text).suffix.lower() in SUFFIXES else [])
     elif _WILD.search(text):
@@ -92,7 +92,7 @@ def _glob(pattern: Path, report: Callable[[Path, str], None]) -> Iterator[Path]:
             return False
         return all(fnmatchcase(name, part) for name, part in zip(folders, rest[:fixed], strict=False))
 
-    return _walk(root, (), lambda path: _matches(path, rest), enters, report)
+    return _walk(root, lambda path: _matches(path, rest), enters, report)
 
 
 def _matches(path: tuple[str, ...], parts: tuple[str, ...]) -> bool:
@@ -110,31 +110,19 @@ def _is_mesh(name: str) -> bool:
 
 def _walk(
     root: Path,
-    below: tuple[str, ...],
     wanted: Callable[[tuple[str, ...]], bool],
     enters: Callable[[tuple[str, ...]], bool],
     report: Callable[[Path, str], None],
 ) -> Iterator[Path]:
     """Files below a folder that are `wanted`, in name order; a folder that cannot be listed is reported."""
-    folder = root.joinpath(*below)
-    names: list[str] = []
-    folders: list[str] = []
-    try:
-        with os.scandir(folder) as entries:
-            for entry in entries:
-                if entry.is_dir(follow_symlinks=False):
-                    folders.append(entry.name)
-                elif _is_mesh(entry.name) and wanted((*below, entry.name)):
-                    names.append(entry.name)
-    except OSError as error:
-        if not below:
-            raise UnirenderError(
-                f"meshes {folder}: cannot be listed ({error.strerror}); check its permissions"
-            ) from error
-        report(folder, error.strerror or str(error))
-    for name in sorted(names):
-        yield folder / name
-    names.clear()
-    for name in sorted(folders):
-        if not name.startswith(".") and enters((*below, name)):
-            yield from _walk(root, (*below, name), wanted, enters, report)
+
+    def failed(error: OSError) -> None:
+        folder, reason = Path(str(error.filename)), error.strerror or str(error)
+        if folder == root:
+            raise UnirenderError(f"meshes {folder}: cannot be listed ({reason}); check its permissions") from error
+        report(folder, reason)
+
+    for at, folders, names in os.walk(root, onerror=failed):
+        below = Path(at).relative_to(root).parts
+        folders[:] = sorted(name for name in folders if not name.startswith(".") and enters((*below, name)))
+        yield from (root.joinpath(*below, name) for name in sorted(names) if _is_mesh(name) and wanted((*below, name)))
