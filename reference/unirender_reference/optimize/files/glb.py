@@ -1,28 +1,24 @@
-"""A textured object as binary glTF 2.0 (sections 3.6 to 3.9 and 4.4): one mesh, one material, its pictures inside.
+"""A textured object as binary glTF 2.0: one mesh, one material, its pictures inside.
 
 Base colour is stored as sRGB, roughness in G and metallic in B of one linear picture, a normal map as (n + 1) / 2, all
 in 8 bits a channel. Texture coordinates count from the first row here and in glTF alike.
 """
 
-import importlib.metadata
 import io
-import json
-import struct
-from typing import Any
 
 import numpy as np
+import trimesh
 from jaxtyping import UInt8
 from PIL import Image
+from trimesh.exchange.gltf import export_glb
+from trimesh.transformations import scale_and_translate
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from unirender.color import eight_bits, srgb_encode
 from unirender.errors import UnirenderError
 from unirender_reference.meshes.tiles import refined
 from unirender_reference.shapes import MeshObject, Sphere
-
-FLOAT, UNSIGNED = 5126, 5125
-ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
-REPEAT, LINEAR = 10497, 9729
-JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
 def glb_bytes(obj: MeshObject, place: Sphere | None = None) -> bytes:
@@ -35,91 +31,21 @@ def glb_bytes(obj: MeshObject, place: Sphere | None = None) -> bytes:
     Raises:
         UnirenderError: the object lacks texture coordinates or a texture.
     """
-    pictures = texture_pixels(obj)
-    buffer = _Buffer()
-    primitive = {**_geometry(obj, buffer), "material": 0}
-    images = [
-        {"bufferView": buffer.view(png_bytes(pixels)), "mimeType": "image/png", "name": name}
-        for name, pixels in pictures.items()
-    ]
-    node: dict[str, Any] = {"mesh": 0, "name": obj.name}
-    if place is not None:
-        node |= {"translation": place.center.tolist(), "scale": [place.radius] * 3}
-    document = {
-        "asset": {"version": "2.0", "generator": f"unirender {importlib.metadata.version('unirender')}"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": [primitive]}],
-        "materials": [_material(obj.name, list(pictures))],
-        "textures": [{"source": k, "sampler": 0} for k in range(len(images))],
-        "samplers": [{"magFilter": LINEAR, "minFilter": LINEAR, "wrapS": REPEAT, "wrapT": REPEAT}],
-        "images": images,
-        "accessors": buffer.accessors,
-        "bufferViews": buffer.views,
-        "buffers": [{"byteLength": len(buffer.body)}],
-    }
-    text = json.dumps(document, separators=(",", ":")).encode()
-    return _container(text + b" " * (-len(text) % 4), bytes(buffer.body))
-
-
-class _Buffer:
-    """The binary chunk, and what the document says of its parts."""
-
-    def __init__(self) -> None:
-        self.body = bytearray()
-        self.views: list[dict[str, int]] = []
-        self.accessors: list[dict[str, Any]] = []
-
-    def view(self, data: bytes, **more: int) -> int:
-        """Appends a part; returns the index of its view."""
-        self.views.append({"buffer": 0, "byteOffset": len(self.body), "byteLength": len(data), **more})
-        self.body.extend(data + b"\0" * (-len(data) % 4))
-        return len(self.views) - 1
-
-    def accessor(self, values: np.ndarray, kind: str, component: int, target: int, **more: Any) -> int:
-        """Appends an array; returns the index of its accessor."""
-        where = self.view(np.ascontiguousarray(values).tobytes(), target=target)
-        self.accessors.append(
-            {"bufferView": where, "componentType": component, "count": len(values), "type": kind, **more}
-        )
-        return len(self.accessors) - 1
-
-
-def _geometry(obj: MeshObject, buffer: _Buffer) -> dict[str, Any]:
-    """Attributes and indices of the mesh's primitive, whose arrays go into the buffer."""
+    pictures = {name: Image.fromarray(pixels) for name, pixels in texture_pixels(obj).items()}
     assert obj.uv is not None  # texture_pixels has looked
-    vertices = obj.vertices.astype("<f4")
-    bounds = {"min": vertices.min(0).tolist(), "max": vertices.max(0).tolist()}
-    attributes = {
-        "POSITION": buffer.accessor(vertices, "VEC3", FLOAT, ARRAY_BUFFER, **bounds),
-        "NORMAL": buffer.accessor(obj.normals.astype("<f4"), "VEC3", FLOAT, ARRAY_BUFFER),
-        "TEXCOORD_0": buffer.accessor(obj.uv.astype("<f4"), "VEC2", FLOAT, ARRAY_BUFFER),
-    }
-    indices = buffer.accessor(obj.faces.astype("<u4").reshape(-1), "SCALAR", UNSIGNED, ELEMENT_BUFFER)
-    return {"attributes": attributes, "indices": indices}
-
-
-def _material(name: str, pictures: list[str]) -> dict[str, Any]:
-    """The material, whose textures are the pictures of these names in their order."""
-    index = {picture: {"index": k} for k, picture in enumerate(pictures)}
-    material: dict[str, Any] = {
-        "name": name,
-        "doubleSided": True,
-        "pbrMetallicRoughness": {
-            "baseColorTexture": index["base_color"],
-            "metallicRoughnessTexture": index["metallic_roughness"],
-        },
-    }
-    if "normal" in index:
-        material["normalTexture"] = index["normal"]
-    return material
-
-
-def _container(text: bytes, body: bytes) -> bytes:
-    """The file of a JSON chunk and a binary one, whose lengths are multiples of 4."""
-    chunks = struct.pack("<II", len(text), JSON_CHUNK) + text + struct.pack("<II", len(body), BINARY_CHUNK) + body
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+    material = PBRMaterial(
+        name=obj.name,
+        doubleSided=True,
+        baseColorTexture=pictures["base_color"],
+        metallicRoughnessTexture=pictures["metallic_roughness"],
+        normalTexture=pictures.get("normal"),
+    )
+    visual = TextureVisuals(obj.uv * [1, -1] + [0, 1], material=material)  # trimesh: v from below
+    mesh = trimesh.Trimesh(obj.vertices, obj.faces, vertex_normals=obj.normals, visual=visual, process=False)
+    scene = trimesh.Scene()
+    transform = None if place is None else scale_and_translate(place.radius, place.center)
+    scene.add_geometry(mesh, node_name=obj.name, geom_name=obj.name, transform=transform)
+    return export_glb(scene, include_normals=True, unitize_normals=False)
 
 
 def texture_pixels(obj: MeshObject) -> dict[str, UInt8[np.ndarray, "_ _ 3"]]:
