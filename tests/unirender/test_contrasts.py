@@ -13,7 +13,7 @@ from unirender.training.command import Train
 from unirender.training.config import Augmentation
 from unirender.training.data.contrasts import ContrastDataset, sets_of
 from unirender.training.data.dataset import GroupDataset
-from unirender.training.data.groups import Group, Pair
+from unirender.training.data.packing import Group, Pair
 from unirender.training.data.source import ShardSource
 from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.plan import OBJECT_BLOCK, plan_groups

@@ -23,7 +23,7 @@ from unirender.errors import UnirenderError
 from unirender.training.augmentations.augment import Draw, draw
 from unirender.training.config import Augmentation
 from unirender.training.data.dataset import GroupDataset
-from unirender.training.data.groups import Group, Pair
+from unirender.training.data.packing import Group, Pair
 
 Member = tuple[int, int]  # number of a group, number of a pair in it
 

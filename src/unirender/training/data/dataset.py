@@ -27,7 +27,8 @@ from unirender.training.augmentations.moving import moved
 from unirender.training.augmentations.repaint import mean_colour, recoloured, repaint
 from unirender.training.config import Augmentation
 from unirender.training.data.derived import DerivedLight, open_derived
-from unirender.training.data.groups import Pair, Shard, list_shards, open_packed, read_environments
+from unirender.training.data.groups import Shard, list_shards, open_packed, read_environments
+from unirender.training.data.packing import Pair
 from unirender.training.data.rows import SampleRows, basis_rows, shared_maps, trailing, with_material
 
 DERIVED_MAPS = ("derived_specular", "derived_diffuse")  # s and d as derived from the light, where `derived` is 1
@@ -288,6 +289,3 @@ def make_batch(
             stacked[i] = np.moveaxis(sample[name], -1, 0)
         batch[name] = torch.from_numpy(stacked)
     return moved(batch, [draw.move for _, _, draw in drawn])
-
-
-__all__ = ["Augmentation", "Batch", "GroupDataset", "make_batch"]

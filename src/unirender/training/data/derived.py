@@ -29,7 +29,8 @@ from unirender.light.surface_light import diffuse_light, specular_light
 from unirender.pipelines.shadowed_light import SeenShadows
 from unirender.system.paths import cache_dir, cached_folder
 from unirender.system.worker_pool import WorkerPool
-from unirender.training.data.groups import Group, Shard, mapped, read_environments, store
+from unirender.training.data.groups import Shard, mapped, read_environments, store
+from unirender.training.data.packing import Group
 
 logger = logging.getLogger(__name__)
 

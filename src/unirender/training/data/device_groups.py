@@ -30,7 +30,7 @@ from unirender.training.augmentations.augment import Draw, metallic_weights
 from unirender.training.augmentations.moving import moved
 from unirender.training.augmentations.repaint import CHANNEL_RANGE, POWER_RANGE
 from unirender.training.data.dataset import DERIVED_MAPS, Batch, GroupDataset
-from unirender.training.data.groups import SCALAR_CHANNELS, Pair
+from unirender.training.data.packing import SCALAR_CHANNELS, Pair
 from unirender.training.data.rows import SampleRows
 
 SHARED_CHANNELS = SCALAR_CHANNELS + 2  # with roughness and metallic maps, whether a group has them or not

@@ -30,7 +30,7 @@ from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, read_exr_bytes
 from unirender.system.paths import cache_dir, cached_folder
 from unirender.system.whole_files import file_sha256
-from unirender.training.data.packing import SCALAR_CHANNELS, Group, Packer, Pair
+from unirender.training.data.packing import Group, Packer, Pair
 
 PACK_VERSION = 3  # part of the cache's path: raise it when what is packed, or refused, changes
 END_OF_ARCHIVE = bytes(1024)  # two blocks, with which a tar ends
@@ -292,20 +292,3 @@ def _pack(path: Path, folder: Path) -> None:
         for name, array in packer.arrays().items():
             store(made / f"{name}.npy", array)
         (made / "index.json").write_text(json.dumps([asdict(group) for group in groups]))
-
-
-__all__ = [
-    "SCALAR_CHANNELS",
-    "Group",
-    "Pair",
-    "Shard",
-    "damaged",
-    "list_shards",
-    "mapped",
-    "open_packed",
-    "read_environments",
-    "read_groups",
-    "split_of",
-    "store",
-    "unread_shards",
-]

@@ -8,7 +8,8 @@ from jaxtyping import Float, Float16, Int
 from unirender.errors import UnirenderError
 from unirender.light.symmetries import Maps
 from unirender.training.augmentations.augment import METALLIC_NODES
-from unirender.training.data.groups import SCALAR_CHANNELS, Group, Shard
+from unirender.training.data.groups import Shard
+from unirender.training.data.packing import SCALAR_CHANNELS, Group
 
 
 @dataclass(frozen=True)
