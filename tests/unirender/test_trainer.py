@@ -419,15 +419,6 @@ def test_a_resume_says_where_another_number_of_passes_changes_it(tmp_path: Path)
     assert line in [json.loads(text) for text in (tmp_path / "log.jsonl").read_text().splitlines()]
 
 
-def test_a_state_without_the_number_of_passes_resumes(tmp_path: Path) -> None:
-    """As version 0.1.0 wrote them."""
-    fit(tmp_path, 1)
-    state = load_state(tmp_path)
-    assert state is not None
-    save_state(tmp_path, {name: value for name, value in state.items() if name not in ("parts", "unlogged")})
-    assert [line["step"] for line in fit(tmp_path, 2)] == [2]
-
-
 def test_a_state_of_an_older_version_resumes_with_defaults_for_what_it_did_not_know(tmp_path: Path) -> None:
     run_for(tmp_path, 1)
     state = load_state(tmp_path)
@@ -678,14 +669,6 @@ def test_a_resume_with_another_beginning_is_refused(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "0")
     shutil.copytree(tmp_path / "1", tmp_path / "0")
     resumed("first", tmp_path / "0")  # the same command line, whatever has become of the folder
-
-    state = load_state(tmp_path / "first")
-    assert state is not None
-    save_state(tmp_path / "first", {key: value for key, value in state.items() if key != "begun_with"})
-    older = resumed("first", tmp_path / "elsewhere" / "moved")
-    assert older.begun_with is None
-    older.save(SyntheticSource())
-    resumed("first", tmp_path / "1")
 
 
 def test_loading_what_a_run_begins_with_shows_no_bars(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

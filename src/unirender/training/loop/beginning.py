@@ -1,7 +1,7 @@
 """What a run was begun with, as its state holds it, so that a resume with something else is noticed.
 
 A plain dict of `option` (that named it), `name` (what was given), `path` and, of a pipeline, `sha256`; {} where it
-began with chance. States of earlier versions do not say: None.
+began with chance.
 """
 
 from pathlib import Path
@@ -26,7 +26,7 @@ def beginning(option: str, given: Path, folder: Path, weights: bool = True) -> B
     return found | ({"sha256": checkpoint_sha256(folder)} if weights else {})
 
 
-def check_beginning(out: Path, begun: Beginning | None, asked: Beginning) -> None:
+def check_beginning(out: Path, begun: Beginning, asked: Beginning) -> None:
     """Looks whether a run that is resumed was begun with what it is now asked to begin with.
 
     The same place or the same weights will do: one command line goes on whatever becomes of the folder that it names,
@@ -36,7 +36,7 @@ def check_beginning(out: Path, begun: Beginning | None, asked: Beginning) -> Non
     Raises:
         UnirenderError: it was begun with something else.
     """
-    if begun is None or not asked:
+    if not asked:
         return
     unknown = begun.get("option") == asked["option"] and "sha256" not in asked
     if unknown or any(begun.get(key) == value for key, value in asked.items() if key in KNOWN_BY):

@@ -18,7 +18,10 @@ from unirender.training.optim.passes import laid_out_like
 if TYPE_CHECKING:
     from unirender.training.loop.trainer import Trainer
 
-OF_A_STATE = ("config", "step", "seconds", "model", "ema", "optimizer", "generator", "source")  # of every version
+OF_A_STATE = (
+    *("config", "step", "seconds", "model", "ema", "optimizer", "loss_scale", "generator", "parts"),
+    *("unlogged", "continues", "begun_with", "source", "shown"),
+)
 OF_ALL = ("steps", "minutes", "log_every", "parallel", "accumulate")  # entries of the run by which all processes act
 
 
@@ -62,25 +65,22 @@ def resume(trainer: "Trainer", source: BatchSource, report: Report = lambda line
             f"{trainer.run.out}: holds a run with {', '.join(differing)}; repeat the options of that run, or pass "
             "another --out"
         )
-    begun = state.get("begun_with")
-    check_beginning(trainer.run.out, begun, trainer.begun_with or {})
-    trainer.begun_with = begun
+    check_beginning(trainer.run.out, state["begun_with"], trainer.begun_with)
+    trainer.begun_with, trainer.continues = state["begun_with"], state["continues"]
     trainer.step, trainer.seconds = state["step"], state["seconds"]
-    trainer.continues = state.get("continues", trainer.continues)  # states of version 0.1.0 do not say
     trainer.model.load_state_dict(state["model"])
     trainer.ema.load_state_dict(state["ema"])
     trainer.optimizer.load_state_dict(state["optimizer"])
     for p, moments in trainer.optimizer.state.items():
         same_shape = {name: value for name, value in moments.items() if value.shape == p.shape}
         moments.update({name: laid_out_like(p, value) for name, value in same_shape.items()})
-    trainer.loss_scale.load_state_dict(state.get("loss_scale", {}))
+    trainer.loss_scale.load_state_dict(state["loss_scale"])
     trainer.generator.set_state(state["generator"])
-    trainer.log.waiting.update(state.get("unlogged", {}))
+    trainer.log.waiting.update(state["unlogged"])
     source.load_state_dict(state["source"])
-    trainer.shown = state.get("shown", {})
+    trainer.shown = state["shown"]
     trainer.log.forget_after(trainer.step)
-    parts = state.get("parts", state.get("parallel", trainer.split.all_parts))  # older states: parallel, or nothing
-    if parts != trainer.split.all_parts:
+    if (parts := state["parts"]) != trainer.split.all_parts:
         news = f"{parts} -> {trainer.split.all_parts}: from here on other noise is drawn than without the change"
         trainer.log.tell({"step": trainer.step, "parts": news}, report)
     return True

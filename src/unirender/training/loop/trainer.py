@@ -90,7 +90,7 @@ class Trainer:
         self.step = 0
         self.seconds = 0.0  # of training, over all resumes
         self.continues: list[dict[str, Any]] = []  # `training.json` of the runs that the weights come from
-        self.begun_with: Beginning | None = {}  # None: a state of an earlier version, which does not say
+        self.begun_with: Beginning = {}
         self.source: BatchSource | None = None  # of the batches, once it trains
         self.shown: Maps = {}  # samples of the first batch: the same in every picture
 
