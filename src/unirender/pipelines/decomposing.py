@@ -24,7 +24,7 @@ from unirender.pipelines.closure import close_decomposition
 from unirender.pipelines.flat_albedo import with_flat_albedo
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.network import Network
-from unirender.pipelines.rendering import renderings
+from unirender.pipelines.rendering import render_any_size
 from unirender.pipelines.results import Decomposition, combine, predicted_intrinsics, with_agreeing_light
 from unirender.pipelines.settings import Sampling, same_noise
 from unirender.pipelines.tiling import add_detail, blend_tiles
@@ -88,7 +88,7 @@ def decompose_views(
         if tile and frame.side > network.size:
             samples[i] = _with_detail(network, view, frame, samples[i], how, _one(how, i).draw_seed())
     if closed:
-        rendered = renderings(network, [sample for own in samples for sample in own], Sampling.of())
+        rendered = render_any_size(network, [sample for own in samples for sample in own], Sampling.of())
         for view, own in zip(views, samples, strict=True):
             for i in range(len(own)):  # one after another, so that what each was before is let go
                 own[i] = close_decomposition(own[i], view.image_linear, next(rendered))

@@ -31,8 +31,10 @@ def render_any_size(
     watch: Callable[[dict[str, Overflow]], None] = lambda overflow: None,
     derived: Collection[str] = (),
     shadows: bool = True,
-) -> list[Float[np.ndarray, "h w 3"]]:
-    """The premultiplied linear images in [0, 1] at the sizes of the intrinsics; one batch of the network.
+) -> Iterator[Float[np.ndarray, "h w 3"]]:
+    """The premultiplied linear images in [0, 1] at the sizes of the intrinsics, one after another.
+
+    The network sees all at once, but of each scene only its small size is kept when its image is there.
 
     Args:
         network: that renders.
@@ -43,19 +45,6 @@ def render_any_size(
         shadows: whether what is derived here, since the intrinsics lack it, has the shadows that the picture's own
             surfaces cast, and what they reflect.
     """
-    return list(renderings(network, scenes, how, watch, derived, shadows))
-
-
-def renderings(
-    network: Network,
-    scenes: Sequence[Intrinsics],
-    how: Sampling,
-    watch: Callable[[dict[str, Overflow]], None] = lambda overflow: None,
-    derived: Collection[str] = (),
-    shadows: bool = True,
-) -> Iterator[Float[np.ndarray, "h w 3"]]:
-    """The images of `render_any_size`, one after another: the network sees all at once, but of each scene only its
-    small size is kept when its image is there."""
     without_shadows = [told_derived(to_derive(scene), shadows).union(derived) for scene in scenes]
     ready = deque(ready_to_render(scene, shadows) for scene in scenes)
     del scenes
