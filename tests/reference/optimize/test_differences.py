@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from unirender_reference.optimize.numerics.differences import difference_matrix, side_by_side
-from unirender_reference.optimize.surface.texels import texel_weights
+from unirender_reference.optimize.surface.textures import texel_weights
 
 
 @pytest.mark.parametrize("around", [False, True])

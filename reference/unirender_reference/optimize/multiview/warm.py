@@ -19,7 +19,7 @@ from unirender.light.environment import resample_environment, rotate_environment
 from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.shape.uv import charted
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.surface.texels import texel_weights
+from unirender_reference.optimize.surface.textures import texel_weights
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.scene import object_scene, sensor_at
 from unirender_reference.shapes import MeshObject

@@ -9,15 +9,26 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from jaxtyping import Float
 
+from unirender.light.environment import hat_weights
 from unirender_reference.optimize.numerics.differences import difference_matrix, side_by_side
 from unirender_reference.optimize.numerics.robust import HUBER
 from unirender_reference.optimize.surface.points import SurfacePoints
-from unirender_reference.optimize.surface.texels import texel_weights
 
 ITERATIONS = 60
 SMOOTHNESS = (8.0, 15.0, 30.0, 60.0, 120.0, 240.0)
 HELD_OUT = 0.15  # of the pixels
 TIE = 1e-2  # weight of the texels' start values: decides where nothing else does
+
+
+def texel_weights(uv: Float[np.ndarray, "n 2"], size: int) -> sp.csr_matrix:
+    """(n, size^2): what each texel counts in each lookup, as Mitsuba's `bitmap` reads a texture: bilinear, repeated."""
+    across, down = (hat_weights(place * size - 0.5, size, wrap=True) for place in uv.T.astype(np.float64))
+    x, y = (weights.indices.reshape(-1, 2) for weights in (across, down))
+    u, v = (weights.data.reshape(-1, 2) for weights in (across, down))
+    texels, weights = y[:, :, None] * size + x[:, None], v[:, :, None] * u[:, None]
+    starts = 4 * np.arange(len(uv) + 1)
+    shape = (len(uv), size**2)
+    return sp.csr_matrix((weights.ravel().astype(np.float32), texels.ravel(), starts), shape=shape)
 
 
 def footprint(points: SurfacePoints, size: int) -> sp.csr_matrix:
