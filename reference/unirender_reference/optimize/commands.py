@@ -207,9 +207,10 @@ class Optimize:
         from rich.console import Console
 
         from unirender.files import new_folder, write_result
+        from unirender_reference.optimize.files.state import history_line
         from unirender_reference.optimize.show.live import live_report
         from unirender_reference.optimize.show.report import Report
-        from unirender_reference.optimize.single.picture import history_text, read_picture_input
+        from unirender_reference.optimize.single.picture import read_picture_input
         from unirender_reference.optimize.single.render import rerendered
         from unirender_reference.optimize.single.run import optimize_image
 
@@ -254,7 +255,7 @@ class Optimize:
             with writing(self.out, ELSEWHERE):
                 write_result(folder, found, meta, again.image_linear)
                 again.strip.save(folder / "views.png")
-                (folder / "history.jsonl").write_text(history_text(steps), encoding="utf-8")
+                (folder / "history.jsonl").write_text("".join(map(history_line, steps)), encoding="utf-8")
         print(f"{self.out}: {seconds:.1f} s; masked PSNR of the picture, rendered again: {again.psnr_db:.2f} dB")
         print(kept_note(trust, start is not None))
         return 0

@@ -12,12 +12,12 @@ from reference_scenes import environment
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
-from unirender.exr import image_channels, write_exr
+from unirender.exr import channels_rgb, image_channels, read_exr, write_exr
 from unirender.light.environment import area_pixels, environment_directions, middle_rows, sample_environment
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights import load_light
 from unirender_reference.meshes import load_mesh, load_mesh_placed
-from unirender_reference.optimize.files.export import FINER, read_environment, write_solution
+from unirender_reference.optimize.files.export import FINER, write_solution
 from unirender_reference.optimize.files.glb import glb_bytes, texture_pixels
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.scene import envmap_data, sensor_dict
@@ -102,6 +102,10 @@ def test_equal_solutions_give_equal_bytes(solution: Solution, folder: Path, tmp_
     write_solution(dataclasses.replace(solution), tmp_path)
     for path in sorted(folder.rglob("*.*")):
         assert path.read_bytes() == (tmp_path / path.relative_to(folder)).read_bytes(), path.name
+
+
+def read_environment(folder: Path) -> np.ndarray:
+    return channels_rgb(read_exr(folder / "environment.exr")[0])
 
 
 def test_light_is_kept_in_full(solution: Solution, folder: Path):

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from unirender.camera import Camera
-from unirender.exr import channels_rgb, image_channels, read_exr, write_environment, write_exr
+from unirender.exr import image_channels, write_environment, write_exr
 from unirender.light.environment import area_pixels, drawable
 from unirender_reference.optimize.files.glb import glb_bytes, png_bytes, texture_pixels
 from unirender_reference.optimize.solution import Solution
@@ -36,11 +35,6 @@ def write_solution(solution: Solution, folder: Path, place: Sphere | None = None
     write_environment(folder / ENVIRONMENT_FILE, solution.environment, {"object": solution.obj.name})
     write_exr(folder / LATLONG_FILE, image_channels(area_pixels(solution.environment, FINER)), half=False)
     _write_mitsuba(solution, folder / MITSUBA_FOLDER)
-
-
-def read_environment(folder: Path) -> Float[np.ndarray, "eh ew 3"]:
-    """The light of a result."""
-    return channels_rgb(read_exr(folder / ENVIRONMENT_FILE)[0])
 
 
 def write_record(folder: Path, record: Mapping[str, Any]) -> None:

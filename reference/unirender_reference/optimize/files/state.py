@@ -68,7 +68,7 @@ class RunFolder:
     def record(self, step: Step) -> None:
         """Adds a line to the history; it counts once `save` has been called."""
         with (self.out / HISTORY).open("a", encoding="utf-8") as stream:
-            stream.write(json.dumps({**dataclasses.asdict(step), "values": rounded(step.values)}) + "\n")
+            stream.write(history_line(step))
         self._lines += 1
 
     def finish(self, stage: str, found: Solution | MeshObject, seconds: float) -> None:
@@ -148,9 +148,10 @@ def fingerprint(views: Views, *others: Solution | MeshObject | None) -> dict[str
     return found
 
 
-def rounded(values: Mapping[str, float]) -> dict[str, float]:
-    """Figures to seven digits: what float32 knows."""
-    return {name: float(f"{value:.7g}") for name, value in values.items()}
+def history_line(step: Step) -> str:
+    """A step as a line of JSON, its figures to seven digits: what float32 knows."""
+    values = {name: float(f"{value:.7g}") for name, value in step.values.items()}
+    return json.dumps({**dataclasses.asdict(step), "values": values}) + "\n"
 
 
 def _camera(view: View) -> str:

@@ -1,9 +1,7 @@
-"""One picture with what is known of it, for single-view optimisation; and its record."""
+"""One picture with what is known of it, for single-view optimisation."""
 
 import dataclasses
-import json
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +14,8 @@ from unirender.files import read_result
 from unirender.picture_files.display_files import stored_values
 from unirender.pictures import checked_file, read_mask
 from unirender_reference.optimize.files.folder import read_picture_file
-from unirender_reference.optimize.files.state import rounded
 from unirender_reference.optimize.reduction import reduced
-from unirender_reference.optimize.views import Step, View, Views
+from unirender_reference.optimize.views import View, Views
 
 MOST_SATURATED = 0.99  # share of the object's display values
 LEAST_LENGTH = 0.5  # of a stored normal
@@ -238,9 +235,3 @@ def _unit(
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     unit = np.where(length < least, np.array([0, 0, 1], np.float32), vectors / np.maximum(length, SHORTEST))
     return np.where(mask > 0, unit, 0).astype(np.float32)
-
-
-def history_text(steps: Sequence[Step]) -> str:
-    """The record of an optimisation as lines of JSON."""
-    lines = [{**dataclasses.asdict(step), "values": rounded(step.values)} for step in steps]
-    return "".join(json.dumps(line) + "\n" for line in lines)
