@@ -9,8 +9,8 @@ import pytest
 from optimizer_runs import rendered_views, truth
 from posed_views import painted_views
 
+from unirender_reference.optimize.exposure import lit
 from unirender_reference.optimize.files.state import open_run
-from unirender_reference.optimize.multiview.exposure import lit
 from unirender_reference.optimize.multiview.result import stage_records, write_result
 from unirender_reference.optimize.refine.watch import GAIN_DB
 from unirender_reference.optimize.show.strips import MOST_LETTERS, short_names, views_strip

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from unirender.system.whole_files import file_sha256
+from unirender_reference.optimize.exposure import divided_views, exposure_of_views, lit
 from unirender_reference.optimize.files.export import SOLUTION_FILE, write_record, write_solution
 from unirender_reference.optimize.files.state import RunFolder
-from unirender_reference.optimize.multiview.exposure import divided_views, exposure_of_views, lit
 from unirender_reference.optimize.refine.losses import psnr_db
 from unirender_reference.optimize.refine.watch import FIGURE, Watch
 from unirender_reference.optimize.shape.coverage import coverage_of, mask_iou

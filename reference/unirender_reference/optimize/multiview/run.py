@@ -15,11 +15,11 @@ from unirender.arguments import as_instance, as_path
 from unirender.errors import UnirenderError
 from unirender.system.whole_files import file_sha256
 from unirender_reference.backend import renderer_threads
+from unirender_reference.optimize.exposure import divided_views, exposure_of_views, lit
 from unirender_reference.optimize.files.solution import read_solution_file, write_solution_file
 from unirender_reference.optimize.files.state import RunFolder, fingerprint, open_run
 from unirender_reference.optimize.machine import require_memory_for_pictures
 from unirender_reference.optimize.multiview.config import PIXEL_BYTES, OptimizeConfig
-from unirender_reference.optimize.multiview.exposure import divided_views, exposure_of_views, lit
 from unirender_reference.optimize.multiview.result import write_result
 from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.refine.run import HeldOut, refine
