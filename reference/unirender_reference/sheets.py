@@ -74,10 +74,9 @@ def table_sheet(
     return sheet
 
 
-def captioned_sheet(
-    tiles: Sequence[Float[np.ndarray, "h w 3"]], captions: Sequence[str], columns: int, style: Style = LIGHT
-) -> Image.Image:
+def captioned_sheet(tiles: Sequence[Float[np.ndarray, "h w 3"]], captions: Sequence[str], columns: int) -> Image.Image:
     """Tiles of one size, row by row, each over its caption, whose lines are broken between words at a tile's width."""
+    style = LIGHT
     font = ImageFont.load_default(style.font)
     height, width = tiles[0].shape[:2]
     broken = [[part for line in caption.splitlines() for part in _broken(line, width, font)] for caption in captions]

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.color import image_srgb, unpremultiply
-from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
 from unirender_reference.integrators import path_integrator
 from unirender_reference.noise import masked_noise_mse
@@ -90,8 +89,7 @@ def _stacked(pairs: Float[np.ndarray, "r m h w 4"]) -> Float[np.ndarray, "n w 3"
 
 
 def _variance(sweep: Sweep) -> Float[np.ndarray, "r m h w 4"]:
-    if sweep.variance is None:
-        raise UnirenderError("sweep: got one of a single batch, expected several, from which its variance is taken")
+    assert sweep.variance is not None, "of several batches"
     return sweep.variance
 
 
@@ -168,8 +166,7 @@ def cubic_bias(
     area = mask.sum(dtype=np.float64) * 3
     means, errors = [], []
     for found in renders:
-        if found.variance is None:
-            raise UnirenderError("sweep: got renders of a single batch, expected several for the standard error")
+        assert found.variance is not None, "of several batches"
         means.append(float(found.mean[..., :3].sum(dtype=np.float64)) / area)
         errors.append(float(found.variance[..., :3].sum(dtype=np.float64)) / area**2)
     # Neighbouring channels share their samples: three fully correlated channels have three times the variance.
