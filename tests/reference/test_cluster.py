@@ -135,7 +135,6 @@ def test_a_task_that_kills_its_workers_is_given_up(executor: ClusterExecutor) ->
 def test_a_cancelled_task_says_so(executor: ClusterExecutor) -> None:
     future = executor.submit(int, "7")
     future.cancel()
-    assert future.done()
     with pytest.raises(UnirenderError, match="cancelled or the scheduler is gone"):
         future.result(20)
 
