@@ -6,7 +6,6 @@ format, in which colour space, what is ignored, and every reason for a refusal.
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +24,7 @@ from unirender_reference.meshes.obj import read_obj
 from unirender_reference.meshes.off import read_off
 from unirender_reference.meshes.ply import read_ply
 from unirender_reference.meshes.stl import read_stl
-from unirender_reference.meshes.surface import Material, Model, Piece
+from unirender_reference.meshes.surface import Model, Piece
 from unirender_reference.meshes.tiles import Patch
 from unirender_reference.shapes import MeshObject, Sphere, bounding_sphere
 from unirender_reference.shapes.surface import split_corners
@@ -112,40 +111,32 @@ def _one_sentence(path: Path) -> Iterator[None]:
         ) from error
 
 
-@dataclass(frozen=True)
-class _Group:
-    """The pieces of one material that have the same attributes."""
-
-    material: Material
-    pieces: list[Piece]
-
-    def patch(self) -> Patch:
-        sets = self.pieces[0].uv
-        colored = any(piece.colors is not None for piece in self.pieces)
-        colors = [np.ones((len(p.faces), 3, 3)) if p.colors is None else p.colors for p in self.pieces]
-        return Patch(
-            points=np.concatenate([piece.vertices[piece.faces] for piece in self.pieces]),
-            uv={i: np.concatenate([piece.uv[i] for piece in self.pieces]) for i in sets},
-            colors=np.concatenate(colors) if colored else None,
-            material=self.material,
-        )
-
-
-def _grouped(pieces: list[Piece]) -> list[_Group]:
-    groups: dict[tuple[int, frozenset[int]], _Group] = {}
+def _grouped(pieces: list[Piece]) -> list[list[Piece]]:
+    """The pieces of one material that have the same attributes, together."""
+    groups: dict[tuple[int, frozenset[int]], list[Piece]] = {}
     for piece in pieces:
-        key = id(piece.material), frozenset(piece.uv)
-        groups.setdefault(key, _Group(piece.material, [])).pieces.append(piece)
+        groups.setdefault((id(piece.material), frozenset(piece.uv)), []).append(piece)
     return list(groups.values())
+
+
+def _patch(group: list[Piece]) -> Patch:
+    colored = any(piece.colors is not None for piece in group)
+    colors = [np.ones((len(p.faces), 3, 3)) if p.colors is None else p.colors for p in group]
+    return Patch(
+        points=_corners(group),
+        uv={i: np.concatenate([piece.uv[i] for piece in group]) for i in group[0].uv},
+        colors=np.concatenate(colors) if colored else None,
+        material=group[0].material,
+    )
 
 
 def _assembled(path: Path, model: Model) -> tuple[MeshObject, Sphere]:
     """The object of a model's pieces, in the unit sphere, and where it stood."""
     single, doubles = without_doubles(model.pieces)
     groups = _grouped(single)
-    pieces = [piece for group in groups for piece in group.pieces]
-    patches = [group.patch() for group in groups]
-    check_geometry(np.concatenate([patch.points for patch in patches]), max(piece.step for piece in pieces))
+    pieces = [piece for group in groups for piece in group]
+    patches = [_patch(group) for group in groups]
+    check_geometry(_corners(pieces), max(piece.step for piece in pieces))
     atlas = build_atlas(patches)
     sphere = bounding_sphere(np.concatenate([piece.vertices[np.unique(piece.faces)] for piece in pieces]))
     points, corners = _one_array(pieces)
@@ -153,7 +144,7 @@ def _assembled(path: Path, model: Model) -> tuple[MeshObject, Sphere]:
     vertices, faces, normals, uv = split_corners(
         sphere.to_unit(points).astype(np.float32), corners, normals_at_corners, atlas.uv
     )
-    smaller = {SMALLER} if any(group.material.has_smaller_textures() for group in groups) else set()
+    smaller = {SMALLER} if any(group[0].material.has_smaller_textures() for group in groups) else set()
     maps = atlas.maps
     if "roughness" in maps and uv is None:
         uv = np.zeros((len(vertices), 2), np.float32)
