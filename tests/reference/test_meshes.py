@@ -272,6 +272,15 @@ def test_stl_of_words_whose_lines_end_elsewhere(tmp_path, broken):
     assert len(load_mesh(tmp_path / "a.stl").faces) == 12
 
 
+def test_solids_of_an_stl_may_have_any_names(tmp_path):
+    """A name with the word vertex was taken for a point."""
+    text = str(trimesh.creation.box().export(file_type="stl_ascii"))
+    named = re.sub("^solid.*", "solid a vertex of a facet", text, flags=re.MULTILINE)
+    (tmp_path / "a.stl").write_text(named + "\n" + text.replace("0.5", "1.5"))
+    obj = load_mesh(tmp_path / "a.stl")
+    assert (len(obj.faces), obj.provenance["meshes"]) == (24, "2")
+
+
 def test_each_face_of_an_off_file_has_its_color(tmp_path):
     body = "\n".join(["OFF", "4 2 0", *CORNER_LINES, "3 0 1 2 255 0 0", "3 0 2 3 0 0 255 # blue"])
     (tmp_path / "a.off").write_text(body)

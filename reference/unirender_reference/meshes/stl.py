@@ -36,9 +36,12 @@ def read_stl(path: Path) -> Model:
     length = path.stat().st_size
     check_bytes(length, "the file")
     with path.open("rb") as file:
-        text = _is_text(head := file.read(END))
+        head = file.read(END)
         file.seek(0)
-        solids, ignored = (_of_text(file.read()), set[str]()) if text else _of_bytes(file, length, head)
+        if _is_text(head):
+            solids, ignored = _of_text(file.read()), set[str]()
+        else:
+            solids, ignored = _of_bytes(file, length, head)
     return Model([_piece(points.astype(np.float64)) for points in solids], frozenset(ignored))
 
 
