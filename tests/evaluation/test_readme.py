@@ -12,6 +12,7 @@ from safetensors.numpy import save_file
 from unirender.errors import UnirenderError
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation.claims import OPTIMISED
+from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, append_record, write_records, write_run
 from unirender_evaluation.results import readme
 from unirender_evaluation.table_list import ALL_TABLES
@@ -20,16 +21,20 @@ from unirender_evaluation.task import LIGHT
 
 STORED = Path(__file__).resolve().parents[2] / "evaluation" / "results"
 SLOT = "<!-- {0}:begin -->\nwhat was here\n<!-- {0}:end -->\n"
-README = f"# title\n\n{SLOT.format('results')}\n{SLOT.format('checkpoint')}\nend\n"
+README = "# title\n\n" + "\n".join(map(SLOT.format, ("standing", "results", "checkpoint"))) + "\nend\n"
+
+
+def albedo(value: float) -> dict[str, float]:
+    """The PSNR of an albedo, inside the mask and on the whole frame."""
+    return {"albedo.psnr@masked-srgb-raw": value, "albedo.psnr@whole-srgb-raw": value + 5.0}
 
 
 def write_example(folder: Path, limit: int | None = None, suite: str = "tiny") -> Path:
     """A run of one method on two samples of the inverse table."""
     folder.mkdir()
-    values = ({"albedo.psnr@masked-srgb-raw": 20.0}, {"albedo.psnr@masked-srgb-raw": 23.0})
     records = [
-        Record("inverse", "single-image", "mine", f"s{i}", f"object{i}", value, key=f"k{i}")
-        for i, value in enumerate(values)
+        Record("inverse", "single-image", "mine", f"s{i}", f"object{i}", albedo(value), key=f"k{i}")
+        for i, value in enumerate((20.0, 23.0))
     ]
     write_records(folder / "records.jsonl", records)
     methods = (MethodInfo("mine", "Mine", "external"),)
@@ -46,12 +51,23 @@ def write_checkpoint(folder: Path) -> Path:
     return folder
 
 
+def write_ours(run: Path) -> Path:
+    """Gives a run a row of the shipped `tiny`, and makes the other one trivial."""
+    for i in range(2):
+        record = Record("inverse", "single-image", "ours-mean", f"s{i}", f"object{i}", albedo(24.0), key=f"o{i}")
+        append_record(run / "records.jsonl", record)
+    weights = {"weights": checkpoint_sha256(checkpoint_folder("tiny"))}
+    methods = (MethodInfo("mine", "Mine", "trivial"), MethodInfo("ours-mean", "Ours (mean)", "ours", config=weights))
+    write_run(run / "run.json", RunInfo("standard", "0" * 64, 64, methods, date="2026-11-21"))
+    return run
+
+
 def test_the_readme_and_the_stored_tables_show_the_measured_mean(tmp_path: Path) -> None:
-    run = write_example(tmp_path / "run")
+    run = write_ours(write_example(tmp_path / "run", suite="standard"))
     target = tmp_path / "README.md"
     target.write_text(README)
     checkpoint = write_checkpoint(tmp_path / "checkpoint")
-    folder = tmp_path / "stored" / "tiny"
+    folder = tmp_path / "stored" / "standard"
     folder.mkdir(parents=True)
     for name in ("98-a-table-of-before.md", "notes.md"):
         (folder / name).write_text("of an earlier run")
@@ -61,11 +77,16 @@ def test_the_readme_and_the_stored_tables_show_the_measured_mean(tmp_path: Path)
         assert readme.main([str(run), *options]) == 0
 
     text = target.read_text()
-    assert text.startswith("# title\n\n<!-- results:begin -->\n\nPrinted by `make bench` (tiny, 2026-11-21)")
+    assert text.startswith("# title\n\n<!-- standing:begin -->\n\n|  | Ours (mean) |")
+    assert "| albedo, PSNR (dB) ↑ | 24.00 | 21.50 (Mine) |" in text
+    assert "`tiny` on `standard`: 2 objects" in text
+    assert "Rows and columns of what `unirender bench run --suite standard` prints (standard, 2026-11-21)" in text
+    assert "| Uni-Renderer | **23.20** | - |" in text
+    assert "| Ours (mean) | - | 29.00 |" in text  # the whole frame, beside what is published
+    assert "Mine |" not in text  # a row that the README does not show
     assert text.endswith("<!-- checkpoint:end -->\n\nend\n")
     assert "2.5 million parameters" in text
     assert "61 minutes on cpu (bfloat16): 4,000 steps, 48,000 samples" in text
-    assert "21.50" in text
     assert "what was here" not in text
     assert "Protocol:" in text
     stored = [path.read_text() for path in folder.glob("*.md")]
@@ -74,7 +95,7 @@ def test_the_readme_and_the_stored_tables_show_the_measured_mean(tmp_path: Path)
     assert (folder / "notes.md").exists()
 
 
-def test_what_is_said_below_several_tables_is_said_once() -> None:
+def test_what_several_tables_have_is_said_once() -> None:
     methods = (MethodInfo("mine", "Mine", "external", note="said of a row"), MethodInfo("b", "B", "external"))
     records = [
         Record("inverse", "single-image", method, "s", "object", {"albedo.psnr@masked-srgb-raw": 20.0}, key=method)
@@ -83,13 +104,25 @@ def test_what_is_said_below_several_tables_is_said_once() -> None:
     records.append(
         Record("relighting", "from-image-hdri", "mine", "s", "object", {"relit.psnr@masked-srgb-raw": 9.0}, key="k")
     )
-    text = readme.selection(build_tables(records, RunInfo("tiny", "0" * 64, 64, methods), ALL_TABLES))
-    assert text.count("Mine: said of a row") == 1
-    assert text.index("### Relighting") < text.index("### Notes") < text.index("- Mine: said of a row")
+    run = RunInfo("tiny", "0" * 64, 64, methods)
+    text = readme.together(build_tables(records, run, ALL_TABLES, [DEFAULT_VARIANT]))
+    assert text.count("Mine: said of a row") == text.count("colour: sRGB") == 1
+    assert text.count("given: one image and its mask") == text.count("Protocol: given") == 2
+    assert text.index("### Relighting") < text.index(readme.COMMON) < text.index("- Mine: said of a row")
 
-    alone = readme.selection(build_tables(records[:2], RunInfo("tiny", "0" * 64, 64, methods), ALL_TABLES))
+    alone = readme.together(build_tables(records[:2], run, ALL_TABLES, [DEFAULT_VARIANT]))
     assert "Mine: said of a row" in alone
-    assert "### Notes" not in alone
+    assert readme.COMMON not in alone
+
+
+def test_a_table_says_where_it_is_not_as_most_are() -> None:
+    rows, line = "ours-mean", {"albedo.psnr@masked-srgb-raw": 20.0, "albedo.psnr@whole-srgb-raw": 25.0}
+    records = [Record("inverse", "single-image", rows, "s", "object", line, key="k")]
+    run = RunInfo("tiny", "0" * 64, 64, (MethodInfo(rows, "Ours (mean)", "ours"),))
+    whole, masked = build_tables(records, run, ALL_TABLES)
+    *_, first, second, third, common = readme.together([whole, masked, whole]).split("Protocol")
+    assert ["mask: whole frame" in part for part in (first, second, third, common)] == [False, False, False, True]
+    assert "mask: inside the true mask" in second
 
 
 def test_what_is_stored_gives_the_same_again(tmp_path: Path) -> None:
@@ -100,33 +133,28 @@ def test_what_is_stored_gives_the_same_again(tmp_path: Path) -> None:
     assert "results.json.gz" in first
 
 
-def test_another_suite_has_its_own_place_and_fewer_tables(tmp_path: Path) -> None:
-    run = write_example(tmp_path / "run", suite="large")
+def test_the_readme_shows_results_of_one_suite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     target = tmp_path / "README.md"
-    target.write_text(README + SLOT.format("results-large"))
-    options = ["--readme", str(target), "--checkpoint", str(write_checkpoint(tmp_path / "checkpoint"))]
-    assert readme.main([str(run), *options]) == 0
-    before, after = target.read_text().split("<!-- results-large:begin -->")
-    assert "what was here" in before
-    assert "Printed by `unirender bench run --suite large`" in after
-    assert "21.50" in after
+    target.write_text(README)
+    assert readme.main([str(write_example(tmp_path / "run", suite="large")), "--readme", str(target)]) == 1
+    assert "--readme: got results of large, expected those of standard" in capsys.readouterr().err
+    assert target.read_text() == README
 
 
-def test_the_readme_says_where_our_row_stands_on_the_suite_that_strangers_read(tmp_path: Path) -> None:
-    run = write_example(tmp_path / "run", suite="standard")
-    for i in range(2):
-        values = {"albedo.psnr@masked-srgb-raw": 24.0}
-        record = Record("inverse", "single-image", "ours-mean", f"s{i}", f"object{i}", values, key=f"o{i}")
-        append_record(run / "records.jsonl", record)
-    weights = {"weights": checkpoint_sha256(checkpoint_folder("tiny"))}
-    methods = (MethodInfo("mine", "Mine", "trivial"), MethodInfo("ours-mean", "Ours (mean)", "ours", config=weights))
-    write_run(run / "run.json", RunInfo("standard", "0" * 64, 64, methods, date="2026-11-21"))
-    target = tmp_path / "README.md"
-    target.write_text(README + SLOT.format("results-standard") + SLOT.format("standing"))
-    assert readme.main([str(run), "--readme", str(target)]) == 0
-    standing = target.read_text().split("<!-- standing:begin -->")[1]
-    assert "| albedo, PSNR (dB) ↑ | 24.00 | 21.50 (Mine) |" in standing
-    assert "`tiny` on `standard`: 2 objects" in standing
+def test_the_readme_counts_the_claims(tmp_path: Path) -> None:
+    rows = {"ours-mean": (24.0, 25.0, 23.0), "input-as-albedo": (20.0, 21.0, 20.0), "mean-albedo": (20.0, 27.0, 9.0)}
+    records = [
+        Record("inverse", "single-image", key, f"s{i}", f"object{i}", albedo(value), key=f"{key}{i}")
+        for key, values in rows.items()
+        for i, value in enumerate(values)
+    ]
+    (tmp_path / "run").mkdir()
+    write_records(tmp_path / "run" / "records.jsonl", records)
+    methods = tuple(MethodInfo(key, key, "ours" if key == "ours-mean" else "trivial") for key in rows)
+    write_run(tmp_path / "run" / "run.json", RunInfo("none", "0" * 64, 64, methods, date="2026-11-21"))
+    lines = readme.verdict_counts(readme.whole_run(tmp_path / "run")[0]).splitlines()
+    assert lines[0] == "- Of 2 claims 1 hold, 1 are open, 0 fail."
+    assert lines[1].startswith("- Of 1 claims that hold 1 also do after Holm's correction for all 2")
 
 
 @pytest.mark.parametrize(
@@ -180,15 +208,16 @@ def test_the_projects_tables_and_readme_are_those_of_its_stored_values(suite: st
     target.write_text(own)
     _, _, checkpoint = suite.partition("-")
     # In a process of its own: the checks of every call that tests run under take ten times as long as the work.
-    options = ["--stored", str(tmp_path), *(["--of", checkpoint] if checkpoint else ["--readme", str(target)])]
+    where = ["--readme", str(target)] if suite == readme.README_SUITE else []
+    options = ["--stored", str(tmp_path), *(["--of", checkpoint] if checkpoint else where)]
     subprocess.run(
         [sys.executable, "-m", "unirender_evaluation.results.readme", str(STORED / suite), *options], check=True
     )
     folders = STORED / suite, tmp_path / suite
     committed, made = ({path.name: path.read_text() for path in folder.glob("*.md")} for folder in folders)
     again = (
-        "make them again: python -m unirender_evaluation.results.readme evaluation/results/SUITE --readme README.md "
-        "--stored evaluation/results (SUITE-CHECKPOINT: --of CHECKPOINT instead of --readme)"
+        "make them again: python -m unirender_evaluation.results.readme evaluation/results/SUITE --stored "
+        "evaluation/results (standard: --readme README.md; SUITE-CHECKPOINT: --of CHECKPOINT)"
     )
     assert committed == made, again
     assert target.read_text() == own, again

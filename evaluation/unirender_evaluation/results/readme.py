@@ -2,9 +2,9 @@
 
     python -m unirender_evaluation.results.readme RUN [--readme README.md] [--stored FOLDER] [--of CHECKPOINT]
 
-`RUN` is the folder that `unirender bench run` wrote, or its results file. The README gets tables of the suite and the
-facts of the checkpoint, between comments made for them: all of `SHOWN` for the suite that ships, else `HEADLINES`; of
-`standard` also a table of a few lines, `STANDING`.
+`RUN` is the folder that `unirender bench run` wrote, or its results file. The README shows results of `standard` alone,
+between comments made for them: where our model stands (`STANDING`), and rows and columns of the paper's tables and of
+the physics table, with the counts of the verdict; and the facts of the checkpoints.
 The stored folder (`evaluation/results` of a checkout, which the documentation reads) gets a folder by the name of the
 suite, with every value (`results.json.gz`) and one Markdown file per table; from that file the command makes both anew.
 Its rows of ours must be those of the shipped checkpoint that the suite takes by itself. With `--of` those of another
@@ -17,7 +17,7 @@ import math
 import re
 import sys
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,34 +28,45 @@ from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for,
 from unirender.system.whole_files import replace_file
 from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.light_balls import MATTE_BALL
+from unirender_evaluation.metrics import DEFAULT_VARIANT, PUBLISHED_VARIANT, Variant
 from unirender_evaluation.records import Record
+from unirender_evaluation.results.commands import columns_of
 from unirender_evaluation.results.data import NAME, PACKED, Results
 from unirender_evaluation.results.file import read_results, write_results
 from unirender_evaluation.results.findings import Question, against_trivial
+from unirender_evaluation.results.lights import lights_of
 from unirender_evaluation.subsets import STANDARD
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables.build import Table, build_tables
 from unirender_evaluation.tables.formats import to_markdown
+from unirender_evaluation.tables.protocol import protocol_text
 from unirender_evaluation.tables.text import plain_paragraph
 from unirender_evaluation.task import LIGHT
+from unirender_evaluation.verdict import judged, summary
 
-SHIPPED_SUITE = "tiny"
-STANDING_SUITE = "standard"
-SHOWN = (  # table, protocol, subset
-    ("rendering", "from-image", "main"),
-    ("inverse", "single-image", "main"),
-    ("relighting", "from-image-hdri", "main"),
-    (*LIGHT, "main"),
-    ("multi-view", "known-mesh", "main"),
-    ("physics", "physics", "main"),
-)
-HEADLINES = SHOWN[:3]
+README_SUITE = "standard"
+PAPER = {"rendering": "from-image", "inverse": "single-image", "relighting": "from-image-sd"}  # protocols, by table
+PHYSICS = {"physics": "physics"}
+PAPER_METRICS = ("psnr", "lpips_vgg", "mse", "cosine")
 OURS, SAMPLED = "ours-mean", "ours-sample"
+PAPER_ROWS = (
+    OURS,
+    "ours-mean-anchored",
+    "nvdiffrec-mitsuba",
+    "unedited-input",
+    "input-as-albedo",
+    "constant-0-5",
+    "mean-normal",
+    "noise-ceiling",
+)
+PHYSICS_ROWS = (OURS, "shade-true-maps", "true-maps")
 SUBSETS = (  # method of the dear rows, scenes it sees without an option, and that option
     (OPTIMISED, STANDARD.optimise, "--optimise-scenes"),
     (SAMPLED, STANDARD.sample, "--sample-scenes"),
 )
-NOTES = "### Notes on the rows of these tables"
+WORDS = {"HOLDS": "hold", "open": "are open", "FAILS": "fail"}
+VERDICT = "### The verdict"
+COMMON = "### What holds for these tables"
 STANDING = (
     Question("albedo", "inverse", "single-image", "albedo", "psnr", OURS),
     Question("normals", "inverse", "single-image", "normal", "cosine", OURS),
@@ -155,21 +166,61 @@ def checkpoint_text(folder: Path) -> str:
     )
 
 
-def selection(tables: Sequence[Table], shown: Sequence[tuple[str, str, str]] = SHOWN) -> str:
-    """Those tables, masked, as Markdown; what is to be said below more than one of them follows the last, once."""
-    chosen = [
-        table
-        for table in tables
-        if (table.name, table.protocol_key, table.subset) in shown and table.variant.mask == "masked"
-    ]
-    counts = Counter(note for table in chosen for note in table.notes)
-    common = [note for note, count in counts.items() if count > 1]
+def chosen(
+    results: Results, asked: Mapping[str, str], rows: Collection[str], metrics: Sequence[str], variant: Variant
+) -> list[Table]:
+    """Those tables that have records, of some rows and metrics alone; `asked`: protocols by the tables' names."""
+    run = replace(results.run, methods=tuple(info for info in results.run.methods if info.key in rows))
+    records = [record for record in results.records if record.method in rows]
+    specs = {name: spec for name in asked if (spec := columns_of(ALL_TABLES[name], metrics))}
+    tables = build_tables(records, run, specs, [variant])
+    return [table for table in tables if (asked[table.name], "main") == (table.protocol_key, table.subset)]
+
+
+def together(tables: Sequence[Table]) -> str:
+    """Tables as Markdown; notes of more than one of them, and the protocol that more of them have than any other,
+    follow the last, once."""
+    notes = Counter(note for table in tables for note in table.notes)
+    usual = {}
+    for item, count in Counter(item for table in tables for item in table.protocol).most_common():
+        if count > 1:
+            usual.setdefault(*item)
     texts = [
-        to_markdown(replace(table, notes=tuple(note for note in table.notes if counts[note] == 1))) for table in chosen
+        to_markdown(
+            replace(
+                table,
+                notes=tuple(note for note in table.notes if notes[note] == 1),
+                protocol=tuple((name, value) for name, value in table.protocol if usual.get(name) != value),
+            )
+        )
+        for table in tables
     ]
-    if common:
-        texts.append("\n".join([NOTES, "", *(f"- {plain_paragraph(note)}" for note in common)]) + "\n")
+    if usual:
+        line = plain_paragraph(f"Protocol where a table says nothing else: {protocol_text([*usual.items()])}.")
+        texts.append("\n".join([COMMON, "", line, "", *(f"- {plain_paragraph(n)}" for n in notes if notes[n] > 1)]))
     return "\n".join(texts)
+
+
+def verdict_counts(results: Results) -> str:
+    """How many claims hold, each by itself, by Holm's correction, and under other lights."""
+    found = judged(results.records, results.run, lights_of([results]))
+    words = Counter(finding.word for finding in found if finding.comparison and finding.holds is not None)
+    counts = ", ".join(f"{words[word]} {said}" for word, said in WORDS.items())
+    lines = summary(found, lambda finding: f"{finding.claim.table} {finding.claim.quantity}")
+    said = (f"of {words.total()} claims {counts}", *lines)
+    return "\n".join(f"- {plain_paragraph(line[0].upper() + line[1:])}." for line in said)
+
+
+def results_text(results: Results) -> str:
+    """What the README shows of the results of `README_SUITE`; what the paper leaves open it says in prose."""
+    run = results.run
+    head = f"Rows and columns of what `{run_command(run.suite, results.records)}` prints ({run.suite}, {run.date})."
+    tables = chosen(results, PAPER, PAPER_ROWS, PAPER_METRICS, PUBLISHED_VARIANT)
+    tables += chosen(results, PHYSICS, PHYSICS_ROWS, (), DEFAULT_VARIANT)
+    measured = [
+        replace(table, protocol=tuple(item for item in table.protocol if item[0] != "published")) for table in tables
+    ]
+    return "\n\n".join([head, together(measured).strip(), VERDICT, verdict_counts(results)])
 
 
 def standing_text(results: Results) -> str:
@@ -204,7 +255,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("run", type=Path, help="folder that `unirender bench run --out` wrote, or its results file")
     parser.add_argument(
-        "--readme", type=Path, help="rewritten in place, between its comments `results` and `checkpoint`"
+        "--readme", type=Path, help="rewritten in place, between its comments `standing`, `results` and `checkpoint`"
     )
     parser.add_argument(
         "--checkpoint",
@@ -220,15 +271,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("--of: the README shows the default checkpoint alone; leave out --readme")
     try:
         results, tables = whole_run(arguments.run)
-        suite, date, folder = results.run.suite, results.run.date, place(results, arguments.of)
+        folder = place(results, arguments.of)
         if arguments.readme:
-            shipped = suite == SHIPPED_SUITE
-            command = "make bench" if shipped else run_command(suite, results.records)
-            head = f"Printed by `{command}` ({suite}, {date}); masked. The report has the other variants."
-            slot, shown = ("results", SHOWN) if shipped else (f"results-{suite}", HEADLINES)
-            text = fill(arguments.readme.read_text(encoding="utf-8"), slot, f"{head}\n\n{selection(tables, shown)}")
-            if suite == STANDING_SUITE:
-                text = fill(text, "standing", standing_text(results))
+            if results.run.suite != README_SUITE:
+                raise UnirenderError(
+                    f"--readme: got results of {results.run.suite}, expected those of {README_SUITE}, which alone the "
+                    "README shows; leave out --readme"
+                )
+            text = fill(arguments.readme.read_text(encoding="utf-8"), "results", results_text(results))
+            text = fill(text, "standing", standing_text(results))
             facts = "\n".join(map(checkpoint_text, sorted(arguments.checkpoint, key=trained_pixels)))
             replace_file(arguments.readme, fill(text, "checkpoint", facts))
         if arguments.stored:
