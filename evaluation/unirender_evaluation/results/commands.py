@@ -96,10 +96,12 @@ class BenchTables:
         run, records = rows_of(run, records, self.method)
         specs = {name: spec for name in self.table or ALL_TABLES if (spec := columns_of(ALL_TABLES[name], self.metric))}
         lights = lights_of(found) if self.interval == "objects-and-lights" else None
-        tables = [table for table in build_tables(records, run, specs, variants, lights) if table.columns]
+        tables = [table for table in build_tables(records, run, specs, variants, lights) if table.rows]
         if not tables:
-            asked = ", ".join([*(self.table or ALL_TABLES), *self.method, *self.metric])
-            raise UnirenderError(f"tables: the files have no values of {asked}; name fewer --table, --method, --metric")
+            asked = ", ".join([*(self.table or ALL_TABLES), *self.method, *self.metric, *self.variant])
+            raise UnirenderError(
+                f"tables: the files have no values of {asked}; name fewer --table, --method, --metric, --variant"
+            )
         _print_tables(tables, self.format)
         return 0
 

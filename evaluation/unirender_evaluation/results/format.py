@@ -17,10 +17,10 @@ def comparison_table(found: PairComparison) -> Table:
     same = found.a.label == found.b.label
     title = found.a.label if same else f"A: {found.a.label}, B: {found.b.label}"
     table = Table(box=box.SIMPLE_HEAD, title=escape(f"{found.heading}: {title}"), title_justify="left", pad_edge=False)
-    table.add_column("number", min_width=12)
+    table.add_column("number")
     for name in TITLES:
         table.add_column(name, justify="right", no_wrap=True)
-    table.add_column("verdict", min_width=8)
+    table.add_column("verdict")
     for column in found.columns:
         table.add_row(*map(escape, _cells(column)))
     return table

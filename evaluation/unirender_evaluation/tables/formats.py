@@ -123,7 +123,7 @@ def print_table(console: Console, table: Table) -> None:
     if not _fits(console, table, blocks[0]):
         blocks = [block for group in groups for block in _fitting(console, table, group)]
     for number, indices in enumerate(blocks):
-        rich_table = _rich_table(table, indices, console.width)
+        rich_table = _rich_table(table, indices)
         rich_table.title = escape(table.heading) if number == 0 else None
         print_whole(console, rich_table)
     console.print(f"[dim]{escape(protocol_text(table.protocol))}[/]", highlight=False)
@@ -131,9 +131,9 @@ def print_table(console: Console, table: Table) -> None:
         console.print(f"[dim]{escape(note)}[/]", highlight=False)
 
 
-def _rich_table(table: Table, indices: Sequence[int], width: int) -> RichTable:
+def _rich_table(table: Table, indices: Sequence[int]) -> RichTable:
     rich_table = RichTable(box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
-    rich_table.add_column("Method", no_wrap=False, min_width=min(26, width // 3))
+    rich_table.add_column("Method")
     for i in indices:
         column, name = table.columns[i], f"{table.columns[i].group}\n{header(table.columns[i])}"
         if table.published_columns[i]:
@@ -163,7 +163,7 @@ def _rich_table(table: Table, indices: Sequence[int], width: int) -> RichTable:
 
 
 def _fits(console: Console, table: Table, indices: Sequence[int]) -> bool:
-    return _rich_width(console, _rich_table(table, indices, console.width)) <= console.width
+    return _rich_width(console, _rich_table(table, indices)) <= console.width
 
 
 def _fitting(console: Console, table: Table, indices: Sequence[int]) -> list[list[int]]:

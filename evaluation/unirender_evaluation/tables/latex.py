@@ -1,5 +1,6 @@
 """Tables as LaTeX, in the paper's layout; what stands in them is that of the other formats (`tables.formats`)."""
 
+import re
 import textwrap
 import unicodedata
 from collections.abc import Iterable
@@ -77,12 +78,12 @@ def _latex_cells(row: Row, table: Table) -> list[str]:
     for i, (column, cell, doubled) in enumerate(row_cells(row, table)):
         digits = column.metric.decimals
         if doubled:
-            published = MISSING if cell.published is None else _tex_number(format_number(cell.published, digits))
+            published = MISSING if cell.published is None else tex_text(format_number(cell.published, digits))
             texts.append(_tex_rank(published, cell.published_rank) + (r"$^\dagger$" if cell.dagger else ""))
         if cell.measured is None:
             texts.append(measured_text(cell))
         else:
-            mean, spread = (_tex_number(text) for text in format_estimate(cell.measured, digits))
+            mean, spread = map(tex_text, format_estimate(cell.measured, digits))
             beside = f"{spread}{few(counts, i)}".strip()
             small = rf" {{\scriptsize {beside}}}" if beside else ""
             texts.append(_tex_rank(mean, cell.measured_rank) + small)
@@ -114,11 +115,6 @@ def _tex_rank(text: str, rank: int | None) -> str:
     return {1: rf"\textbf{{{text}}}", 2: rf"\underline{{{text}}}"}.get(rank or 0, text)
 
 
-def _tex_number(text: str) -> str:
-    text = text.replace("±", r"$\pm$").replace("∞", r"$\infty$")
-    return f"$-${text[1:]}" if text.startswith("-") and text != MISSING else text
-
-
 # Characters that mean something to TeX, or are no letters of its fonts; `--` would become a dash.
 _TEX = str.maketrans(
     {character: rf"\{character}" for character in "&%_#${}"}
@@ -144,9 +140,14 @@ _TEX = str.maketrans(
 )
 
 
+# The sign of a number, or of its exponent: in TeX a hyphen is shorter.
+_MINUS = re.compile(r"(?<![\w\-])-(?=[\d.∞])|(?<=\de)-(?=\d)")
+
+
 def tex_text(text: str) -> str:
-    """A text as TeX shows it as it is."""
-    return unicodedata.normalize("NFC", text).translate(_TEX).replace("--", "-{}-")
+    """A text as TeX shows it as it is, on one line."""
+    line = _MINUS.sub("\N{MINUS SIGN}", unicodedata.normalize("NFC", " ".join(text.split())))
+    return line.translate(_TEX).replace("--", "-{}-")
 
 
 def tex_needs(text: str) -> str:
