@@ -3,12 +3,13 @@
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
 import tyro
 from rich.console import Console
+from small_results import RUN, small_records
 from tiny_suites import write_suite
 
 from unirender.cli import main
@@ -16,9 +17,11 @@ from unirender.errors import UnirenderError
 from unirender.models.precision import resolve_device
 from unirender_evaluation.metrics import chosen_variants
 from unirender_evaluation.runs.benchmark import run
-from unirender_evaluation.runs.command import BenchRun, print_verdict
+from unirender_evaluation.runs.command import BenchRun, print_verdict, shown_tables
 from unirender_evaluation.runs.config import BenchConfig, build_rows
 from unirender_evaluation.subsets import STANDARD
+from unirender_evaluation.table_list import ALL_TABLES
+from unirender_evaluation.tables.build import build_tables
 from unirender_evaluation.truth.make import make_truth
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 
@@ -183,6 +186,25 @@ def test_repeated_options_add_up(tmp_path: Path) -> None:
     words = ["--predictions", "a=x", "--method", "m:A", "--predictions", "b=y", "--method", "m:B"]
     command = tyro.cli(BenchRun, args=words)
     assert (command.predictions, command.method) == (("a=x", "b=y"), ("m:A", "m:B"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "variants", "shown"),
+    [
+        ("trivial", (), ["inverse whole"]),
+        ("external", (), ["inverse whole", "relighting masked"]),
+        ("trivial", ("masked", "masked-aligned"), ["inverse masked", "inverse masked"]),
+    ],
+)
+def test_a_run_prints_the_papers_tables_and_those_that_a_row_of_yours_answers(
+    kind: Literal["trivial", "external"], variants: tuple[str, ...], shown: list[str]
+) -> None:
+    """Relighting by an HDRI is none of the paper's protocols."""
+    run_info = replace(RUN, methods=tuple(replace(info, kind=kind) for info in RUN.methods))
+    tables = build_tables(small_records(), run_info, ALL_TABLES, chosen_variants(variants))
+    found = shown_tables(tables, all_variants=bool(variants))
+    assert [f"{table.name} {table.variant.mask}" for table in found] == shown
+    assert len(found) < len(tables)
 
 
 @pytest.mark.parametrize(

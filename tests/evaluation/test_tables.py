@@ -19,7 +19,7 @@ from unirender_evaluation.metrics import ALL_VARIANTS, METRICS, Variant, chosen_
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.statistics import UNPRINTED
 from unirender_evaluation.tables.build import Cell, Row, Table, build_table, build_tables
-from unirender_evaluation.tables.formats import format_number, print_table, to_json, to_markdown
+from unirender_evaluation.tables.formats import format_number, print_table, print_tables, to_json, to_markdown
 from unirender_evaluation.tables.latex import tex_text, to_latex
 from unirender_evaluation.tables.notes import NAMED
 from unirender_evaluation.tables.protocol import mask_source
@@ -554,6 +554,28 @@ def test_a_narrow_terminal_cuts_no_number_short(width: int) -> None:
     nothing = re.compile(r"^ ?\S+(?: \S+)* {2,}-(?: {2,}-)* *$", re.MULTILINE)
     assert not nothing.findall(text), "a row that says nothing in a part is left out of it"
     assert nothing.findall(" InPix2Pix*      -         - ")
+
+
+@pytest.mark.parametrize(("width", "blocks"), [(80, 2), (120, 1)])
+def test_groups_share_a_block_where_they_fit(width: int, blocks: int) -> None:
+    """Each block of a narrow terminal repeats all labels."""
+    spec = replace(TABLES["inverse"], columns=TABLES["inverse"].columns[:1] + TABLES["inverse"].columns[5:7])
+    found = build_table(spec, RECORDS, RUN, protocol="single-image", variant=WHOLE)
+    assert [column.group for column in found.columns] == ["Albedo", "Metallic", "Roughness"]
+    assert printed(found, width).count("Method") == blocks
+
+
+def test_what_several_tables_say_alike_is_printed_once() -> None:
+    buffer = StringIO()
+    tables = [table("whole"), table("masked")]
+    print_tables(Console(file=buffer, width=5000), tables)
+    text = buffer.getvalue()
+    assert [text.count(f"{name}: ") for name in ("variant", "suite", "truth", "exposure")] == [2, 1, 1, 1]
+    for note in {*tables[0].notes, *tables[1].notes}:
+        assert text.count(note) == 1
+    alone = StringIO()
+    print_tables(Console(file=alone, width=200), tables[:1])
+    assert alone.getvalue() == printed(tables[0])
 
 
 def test_a_table_of_texts_is_no_wider_than_its_longest_words() -> None:

@@ -267,13 +267,11 @@ def _validate(path: Path) -> int:
 def _print_tables(tables: "list[Table]", kind: str) -> None:
     from rich.console import Console
 
-    from unirender_evaluation.tables.formats import print_table, to_json, to_markdown
+    from unirender_evaluation.tables.formats import print_tables, to_json, to_markdown
     from unirender_evaluation.tables.latex import to_latex
 
     if kind == "text":
-        console = Console()
-        for table in tables:
-            print_table(console, table)
+        print_tables(Console(), tables)
     elif kind == "json":
         print(to_json(tables), end="")
     else:

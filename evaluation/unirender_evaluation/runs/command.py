@@ -15,7 +15,11 @@ from unirender_evaluation.results.commands import asked_variants
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rich.console import Console
+
+    from unirender_evaluation.tables.build import Table
 
 CLAIM = 9  # columns before a claim of the verdict: whether it holds
 
@@ -108,7 +112,7 @@ class BenchRun:
         from unirender_evaluation.predictions.check import PredictionError
         from unirender_evaluation.runs import benchmark
         from unirender_evaluation.runs.config import BenchConfig
-        from unirender_evaluation.tables.formats import print_table
+        from unirender_evaluation.tables.formats import print_tables
 
         console = Console()
         config = BenchConfig(
@@ -139,11 +143,32 @@ class BenchRun:
         except PredictionError as error:
             print(f"unirender: error: {error}", file=sys.stderr)  # a line for each problem
             return 1
-        for table in result.tables:
-            print_table(console, table)
+        shown = shown_tables(result.tables, all_variants=bool(self.variant))
+        print_tables(console, shown)
         print_verdict(console, result.verdict)
+        if others := [table.heading for table in result.tables if table not in shown]:
+            said = f"{len(others)} more tables in {self.out / 'tables.md'} (`unirender bench tables {self.out}`): "
+            console.print(said + "; ".join(others), highlight=False, markup=False)
         console.print(f"{result.computed} new records of {len(result.records)}; report: {self.out / 'report.html'}")
         return 1 if result.truth_check.get("passed", False) is False else 0
+
+
+def shown_tables(tables: "Sequence[Table]", all_variants: bool) -> "list[Table]":
+    """What a run prints of its tables: the paper's protocols, and what else a row of yours answers.
+
+    Args:
+        tables: of the run.
+        all_variants: in each variant that they have; else in the first, beside the published values where there are.
+    """
+    from unirender_evaluation.tables.specs import PROTOCOLS
+
+    first = {(table.name, table.protocol_key, table.subset): table for table in reversed(tables)}
+    return [
+        table
+        for table in tables
+        if (all_variants or table is first[table.name, table.protocol_key, table.subset])
+        and (PROTOCOLS[table.protocol_key].published or any(row.kind == "external" for row in table.rows))
+    ]
 
 
 def print_verdict(console: "Console", verdict: str) -> None:
