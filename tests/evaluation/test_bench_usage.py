@@ -80,6 +80,16 @@ def test_a_word_that_no_axis_of_a_variant_has(command: list[str], capsys: pytest
     assert "--variant 'whole-shiny': got 'shiny', expected one word" in printed
 
 
+def test_a_run_of_no_rows_is_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, printed = refused(["bench", "run", "--out", str(tmp_path / "out"), "--methods"], capsys)
+    assert status == 2
+    assert "--methods: got no group, expected some of ours, optimisation, trivial and plugins" in printed
+    status, printed = refused(["bench", "run", "--out", str(tmp_path / "out"), "--methods", "plugins"], capsys)
+    assert (status, printed.count("\n")) == (2, 1)
+    assert "no plug-in is installed; name a method by --method FILE.py:CLASS" in printed
+    assert not (tmp_path / "out").exists()
+
+
 def test_an_unknown_device_is_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, printed = refused(["bench", "run", "--device", "foo", "--out", str(tmp_path / "out")], capsys)
     assert status == 2

@@ -95,6 +95,8 @@ class BenchRun:
         if not self.check_scenes and (self.recheck or self.check_seed is not None):
             option = "--recheck" if self.recheck else f"--check-seed {self.check_seed}"
             raise UsageError(f"{option}: expected none with --check-scenes 0, which renders nothing again")
+        if not (self.methods or self.method or self.predictions):
+            raise UsageError("--methods: got no group, expected some of ours, optimisation, trivial and plugins")
         named_folders(self.predictions)
         asked_variants(self.variant)
 
