@@ -82,8 +82,8 @@ def build_rows(config: BenchConfig) -> list[Row]:
     """The rows that a configuration asks for.
 
     Raises:
-        UnirenderError: unknown group, plug-ins alone and none is there, no checkpoint, a device that is not there, broken plug-in or predictions folder,
-            two rows of one name, or one with that of a bound.
+        UnirenderError: unknown group, plug-ins alone and none is there, no checkpoint, a device that is not there,
+            broken plug-in or predictions folder, two rows of one name, or one with that of a bound.
     """
     unknown = sorted(set(config.methods) - set(GROUPS))
     if unknown:

@@ -19,6 +19,7 @@ from unirender_evaluation.tables.formats import (
     row_label,
 )
 from unirender_evaluation.tables.protocol import protocol_text
+from unirender_evaluation.tables.text import TextTable
 
 GREEK = (  # TeX's names from U+03B1 on
     "alpha beta gamma delta varepsilon zeta eta theta iota kappa lambda mu nu xi o pi rho varsigma sigma tau "
@@ -70,6 +71,27 @@ def to_latex(table: Table) -> str:
     lines += [r"\bottomrule", r"\end{tabular}}"]
     lines += [r"\par\smallskip", rf"\parbox{{\textwidth}}{{\scriptsize {_tex_below(table)}}}"]
     text = "\n".join([*lines, r"\end{table*}"]) + "\n"
+    return tex_needs(text) + text
+
+
+def text_latex(table: TextTable, label: str, names: int = 1) -> str:
+    """A table of texts likewise, its notes below; the first `names` columns to the left, numbers to the right."""
+    rows = [tex_row(map(tex_text, row)) for section in table.sections for row in section]
+    below = " ".join(map(tex_text, table.notes))
+    lines = [
+        r"\begin{table*}[t]",
+        r"\centering",
+        rf"\caption{{\textbf{{{tex_text(table.title)}.}}}}",
+        rf"\label{{tab:{label}}}",
+        r"\setlength{\tabcolsep}{4pt}",
+        r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%",
+        rf"\begin{{tabular}}{{{'l' * names}{'r' * (len(table.columns) - names)}}}",
+        r"\toprule",
+        tex_row(map(tex_text, table.columns)),
+        *(r"\midrule", *rows, r"\bottomrule", r"\end{tabular}}"),
+        *(r"\par\smallskip", rf"\parbox{{\textwidth}}{{\scriptsize {below}}}", r"\end{table*}"),
+    ]
+    text = "\n".join(lines) + "\n"
     return tex_needs(text) + text
 
 
@@ -132,6 +154,8 @@ _TEX = str.maketrans(
         "≥": r"$\geq$",
         "≤": r"$\leq$",
         "→": r"$\to$",
+        "↑": r"$\uparrow$",
+        "↓": r"$\downarrow$",
         "\N{MINUS SIGN}": r"$-$",
         "∞": r"$\infty$",
     }
