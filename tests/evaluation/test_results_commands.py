@@ -218,11 +218,11 @@ def test_comparisons_may_count_lights_as_drawn() -> None:
         for key in "ab"
         for i in range(24)
     ]
-    rows = tuple(replace(ours, key=key, label=key) for key in "ab")
-    results = replace(small_results(), run=replace(small_results().run, methods=rows), records=tuple(pair))
+    a, b = (replace(ours, key=key, label=key) for key in "ab")
+    results = replace(small_results(), run=replace(small_results().run, methods=(a, b)), records=tuple(pair))
     found = {}
     for name, asked in (("objects", None), ("lights", lights), ("few", dict.fromkeys(lights, ("one",)))):
-        ((made,),) = (pair.columns for pair in compare_pair(results, results, *rows, DEFAULT_VARIANT, lights=asked))
+        ((made,),) = (pair.columns for pair in compare_pair(results, results, a, b, DEFAULT_VARIANT, lights=asked))
         assert made.comparison is not None
         found[name] = made.comparison
     assert found["objects"].difference.mean == found["lights"].difference.mean == 2
