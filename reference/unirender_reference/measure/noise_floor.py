@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from unirender.command_line.option_checks import at_least
 from unirender.errors import UsageError
 from unirender.system.worker_pool import WorkerPool
 from unirender_reference.measure.size import check_size
@@ -128,10 +127,13 @@ class NoiseFloor:
             UsageError: one is outside its range.
             UnirenderError: the machine has not the memory for the resolution.
         """
-        at_least(1, images=self.images, factor=self.factor, resolution=self.resolution, limit=self.limit)
+        for name in ("images", "factor", "resolution", "limit"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"--{name} {getattr(self, name)}: expected at least 1")
         if not 0 < self.floor < 100:
             raise UsageError(f"--floor {self.floor:g}: expected decibels above 0 and below 100")
-        at_least(0, workers=self.workers, seed=self.seed)
+        if self.workers < 0 or self.seed < 0:
+            raise UsageError(f"--workers {self.workers}, --seed {self.seed}: expected 0 or more")
         check_size(self.resolution)
 
     def run(self) -> int:
