@@ -217,6 +217,14 @@ def test_a_run_prints_the_papers_tables_and_those_that_a_row_of_yours_answers(
     assert len(found) < len(tables)
 
 
+def test_a_run_of_your_row_alone_prints_what_it_answers() -> None:
+    records = [record for record in small_records() if (record.method == "ours-mean") == (record.table == "relighting")]
+    run_info = replace(RUN, methods=(replace(RUN.methods[0], kind="external"), *RUN.methods[1:]))
+    tables = build_tables(records, run_info, ALL_TABLES)
+    assert [table.name for table in tables] == ["inverse", "inverse", "relighting"]
+    assert [table.name for table in shown_tables(tables, all_variants=False)] == ["relighting"]
+
+
 @pytest.mark.parametrize(
     ("terminal", "expected"),
     [

@@ -156,7 +156,8 @@ class BenchRun:
 
 
 def shown_tables(tables: "Sequence[Table]", all_variants: bool) -> "list[Table]":
-    """What a run prints of its tables: the paper's protocols, and what else a row of yours answers.
+    """What a run prints of its tables: all that a row of yours answers, and the paper's protocols, unless your row ran
+    without ours and has no answer there.
 
     Args:
         tables: of the run.
@@ -165,11 +166,13 @@ def shown_tables(tables: "Sequence[Table]", all_variants: bool) -> "list[Table]"
     from unirender_evaluation.tables.specs import PROTOCOLS
 
     first = {(table.name, table.protocol_key, table.subset): table for table in reversed(tables)}
+    kinds = [{row.kind for row in table.rows} for table in tables]
+    yours = any("external" in own for own in kinds)
     return [
         table
-        for table in tables
+        for table, own in zip(tables, kinds, strict=True)
         if (all_variants or table is first[table.name, table.protocol_key, table.subset])
-        and (PROTOCOLS[table.protocol_key].published or any(row.kind == "external" for row in table.rows))
+        and ("external" in own or (PROTOCOLS[table.protocol_key].published and ("ours" in own or not yours)))
     ]
 
 
