@@ -189,15 +189,15 @@ def stranger_claims(row: str) -> tuple[Claim, ...]:
 
 
 def run_claims(records: Sequence[Record], run: RunInfo) -> list[Claim]:
-    """The claims of a run: ours where our rows ran; those about optimisation where both sides did; the closed forms'
-    distance; of strangers' rows those on the tables that they have answers for."""
+    """The claims of a run: ours where our rows ran; those about optimisation where both sides did; of strangers' rows
+    those on the tables that they have answers for; the closed forms' distance."""
     ours = any(info.kind == "ours" for info in run.methods)
     claims = list(OUR_CLAIMS) if ours else []
     present: dict[tuple[str, str, str], set[str]] = {}
     for r in records:
         present.setdefault((r.table, r.protocol, r.method), set()).update(r.values)
     others = [c for info in run.methods if info.kind == "external" for c in stranger_claims(info.key)]
-    optional = [*given_claims(SPLIT_SUM, (COMPOSITE,)), *given_claims(SHADOWED, (SPLIT_SUM,)), *others]
+    optional = [*others, *given_claims(SPLIT_SUM, (COMPOSITE,)), *given_claims(SHADOWED, (SPLIT_SUM,))]
 
     def ran(claim: Claim, row: str) -> bool:
         return claim.key in present.get((claim.table, claim.protocol, row), ())

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import DEFAULT_VARIANT, SCALES, Metric
@@ -45,13 +45,15 @@ class Comparison:
 
     @property
     def decided(self) -> bool:
-        """Whether there is an interval: with fewer than `statistics.FEWEST` objects there is none."""
+        """Whether there is an interval: with fewer than `statistics.FEWEST` objects there is none, nor of few lights
+        where they count as drawn."""
         return math.isfinite(self.difference.low)
 
     @property
     def verdict(self) -> str:
         if not self.decided:
-            return f"is not comparable on fewer than {FEWEST} objects with"
+            few = f"on fewer than {FEWEST} objects" if self.difference.clusters < FEWEST else "under so few lights"
+            return f"is not comparable {few} with"
         if self.a_beats_b or self.b_beats_a:
             return "beats" if self.a_beats_b else "is beaten by"
         return "is level with" if self.equal else "is not told from"
@@ -147,6 +149,15 @@ def compare(records: Sequence[Record], metric: Metric, key: str, a: str, b: str)
         b_beats_a=beats(settled, values[a], higher_is_better=better, clusters=clusters),
         equal=all(values[a][sample] == settled[sample] for sample in values[a].keys() & settled.keys()),
     )
+
+
+def under_other_lights(found: Comparison, records: Sequence[Record], metric: Metric, lights: Lights) -> Comparison:
+    """The same comparison with its interval over objects and lights, by which it is judged; arguments as in
+    `compare`, raises as `over_lights` does."""
+    wider = difference_over_lights(records, found.key, found.a, found.b, lights)
+    above, below = (False, False) if found.equal else (wider.low > 0, wider.high < 0)
+    beats_beaten = (above, below) if metric.higher_is_better else (below, above)
+    return replace(found, difference=wider, a_beats_b=beats_beaten[0], b_beats_a=beats_beaten[1])
 
 
 def verdicts(

@@ -13,7 +13,7 @@ from rich.console import Console
 from tiny_suites import make_suite
 
 from unirender.camera import Camera
-from unirender.errors import UnirenderError
+from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import Intrinsics
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation import engine
@@ -40,6 +40,8 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
 def test_row_groups_are_checked(tmp_path: Path) -> None:
     with pytest.raises(UnirenderError, match="expected some of ours, optimisation, trivial, plugins"):
         build_rows(BenchConfig(methods=("everything",)))
+    with pytest.raises(UsageError, match=r"--methods plugins: got no row, .* by --method FILE.py:CLASS or --predict"):
+        build_rows(BenchConfig(methods=("plugins",)))
     with pytest.raises(UnirenderError, match="no checkpoint in"):
         build_rows(BenchConfig(methods=("ours",), checkpoint=tmp_path))
 

@@ -3,12 +3,13 @@
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
 import tyro
 from rich.console import Console
+from small_results import RUN, small_records
 from tiny_suites import write_suite
 
 from unirender.cli import main
@@ -16,9 +17,11 @@ from unirender.errors import UnirenderError
 from unirender.models.precision import resolve_device
 from unirender_evaluation.metrics import chosen_variants
 from unirender_evaluation.runs.benchmark import run
-from unirender_evaluation.runs.command import BenchRun, print_verdict
+from unirender_evaluation.runs.command import BenchRun, print_verdict, shown_tables
 from unirender_evaluation.runs.config import BenchConfig, build_rows
 from unirender_evaluation.subsets import STANDARD
+from unirender_evaluation.table_list import ALL_TABLES
+from unirender_evaluation.tables.build import build_tables
 from unirender_evaluation.truth.make import make_truth
 from unirender_reference.folder_lock import LOCK, locked, made_folder
 
@@ -75,6 +78,16 @@ def test_a_word_that_no_axis_of_a_variant_has(command: list[str], capsys: pytest
     status, printed = refused(["bench", *command, *words], capsys)
     assert status == 2
     assert "--variant 'whole-shiny': got 'shiny', expected one word" in printed
+
+
+def test_a_run_of_no_rows_is_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, printed = refused(["bench", "run", "--out", str(tmp_path / "out"), "--methods"], capsys)
+    assert status == 2
+    assert "--methods: got no group, expected some of ours, optimisation, trivial and plugins" in printed
+    status, printed = refused(["bench", "run", "--out", str(tmp_path / "out"), "--methods", "plugins"], capsys)
+    assert (status, printed.count("\n")) == (2, 1)
+    assert "no plug-in is installed; name a method by --method FILE.py:CLASS" in printed
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_unknown_device_is_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -183,6 +196,33 @@ def test_repeated_options_add_up(tmp_path: Path) -> None:
     words = ["--predictions", "a=x", "--method", "m:A", "--predictions", "b=y", "--method", "m:B"]
     command = tyro.cli(BenchRun, args=words)
     assert (command.predictions, command.method) == (("a=x", "b=y"), ("m:A", "m:B"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "variants", "shown"),
+    [
+        ("trivial", (), ["inverse whole"]),
+        ("external", (), ["inverse whole", "relighting masked"]),
+        ("trivial", ("masked", "masked-aligned"), ["inverse masked", "inverse masked"]),
+    ],
+)
+def test_a_run_prints_the_papers_tables_and_those_that_a_row_of_yours_answers(
+    kind: Literal["trivial", "external"], variants: tuple[str, ...], shown: list[str]
+) -> None:
+    """Relighting by an HDRI is none of the paper's protocols."""
+    run_info = replace(RUN, methods=tuple(replace(info, kind=kind) for info in RUN.methods))
+    tables = build_tables(small_records(), run_info, ALL_TABLES, chosen_variants(variants))
+    found = shown_tables(tables, all_variants=bool(variants))
+    assert [f"{table.name} {table.variant.mask}" for table in found] == shown
+    assert len(found) < len(tables)
+
+
+def test_a_run_of_your_row_alone_prints_what_it_answers() -> None:
+    records = [record for record in small_records() if (record.method == "ours-mean") == (record.table == "relighting")]
+    run_info = replace(RUN, methods=(replace(RUN.methods[0], kind="external"), *RUN.methods[1:]))
+    tables = build_tables(records, run_info, ALL_TABLES)
+    assert [table.name for table in tables] == ["inverse", "inverse", "relighting"]
+    assert [table.name for table in shown_tables(tables, all_variants=False)] == ["relighting"]
 
 
 @pytest.mark.parametrize(

@@ -128,8 +128,10 @@ def answers(mistake: str, gains: Sequence[float], quantity: str = "albedo", obje
         ("if_bgr", [2.0] * 4 + [-0.09] * 9, "4 of 4, +2.0 dB"),
         ("if_bgr", [0.9] * 9, ""),  # too little of an order
         ("if_bgr", [1.1] * 9, "9 of 9, +1.1 dB"),
-        ("if_encoded", [3.9] * 9, ""),  # or of a curve, as which another scale looks
-        ("if_encoded", [4.1] * 9, "9 of 9, +4.1 dB"),
+        ("if_encoded", [3.9, 2.0, 0.2] * 2, ""),  # or of a curve, as which another scale looks
+        ("if_encoded", [4.1, 7.9, 0.3] * 2, "6 of 6, +4.1 dB"),
+        ("if_encoded", [3.9, 2.0, 0.2] * 9, "27 of 27, +2.0 dB"),  # unless other objects would show it, too
+        ("if_encoded", [1.1, 0.8] * 9, ""),
     ],
 )
 def test_a_note_takes_nearly_all_pictures_enough_objects_and_a_mean_gain(

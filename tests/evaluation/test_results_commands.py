@@ -6,11 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from small_results import HASH, small_document, small_results, written
+from small_results import HASH, METHODS, small_document, small_results, written
 
 from unirender.cli import main
 from unirender.errors import UnirenderError
+from unirender_evaluation.comparisons import over_lights
 from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS
+from unirender_evaluation.records import Record
 from unirender_evaluation.results.compare import Rank, chosen_pairs, compare_pair, rank
 from unirender_evaluation.results.listing import LISTINGS, METHOD_GROUPS
 from unirender_evaluation.runs.config import GROUPS
@@ -182,6 +184,53 @@ def test_compare_prints_both_means_the_difference_and_the_ranks_in_80_columns(be
     status, out, _ = bench("compare", files[0], files[0], "--method", "ours-mean=input-as-albedo")
     assert "A: Ours (mean), B: input as albedo" in out
     assert "A beats B" in out
+
+
+def test_compare_prints_what_is_asked_for_in_every_format(bench, files: tuple[Path, Path]) -> None:
+    asked = ("compare", *files, "--method", "ours-mean", "--table", "inverse", "--metric", "psnr", "--format")
+    status, out, _ = bench(*asked, "json")
+    (number,) = (made := json.loads(out))["numbers"]
+    assert (status, made["interval"]) == (0, "objects")
+    assert (number["table"], number["metric"], number["difference"], number["n"]) == ("inverse", "psnr", -2.5, 4)
+    assert number["verdict"] == "A is not told from B"
+    line = "| Albedo PSNR (dB) ↑ | 20.75 (1 of 2) | 23.25 (1 of 2) | -2.50 [-5.86, +0.86] | 4 (3) |"
+    assert line in bench(*asked, "markdown")[1].replace("\N{NO-BREAK SPACE}", " ")
+    latex = bench(*asked, "latex")[1]
+    assert r"Albedo PSNR (dB) $\uparrow$ & 20.75 (1 of 2) & 23.25 (1 of 2) & $-$2.50 [$-$5.86, +0.86] & 4 (3)" in latex
+    assert "pdflatex has not" not in latex
+    assert r"\begin{tabular}{lrrrrr}" in latex
+    status, out, err = bench(*asked[:-3], "--metric", "cosine")
+    assert (status, out) == (1, "")
+    assert "the rows share no sample of any table that is asked for" in err
+    status, _, err = bench(*asked[:-3], "--metric", "PSNR")
+    assert status == 2
+    assert "did you mean 'psnr'" in err
+
+
+def test_comparisons_may_count_lights_as_drawn() -> None:
+    """The same means with the interval that tables print, and the verdict that follows from it."""
+    ours = METHODS[0]
+    objects = [f"o{i % 6}" for i in range(24)]
+    lights = {f"s{i}": (f"l{i % 8}",) for i in range(24)}
+    of_light = [4.0, 4.0, 4.0, 4.0, 4.0, -4.0, -4.0, -4.0]
+    pair = [
+        Record("inverse", "single-image", key, f"s{i}", objects[i], {KEY: 20 + (1 + of_light[i % 8]) * (key == "a")})
+        for key in "ab"
+        for i in range(24)
+    ]
+    a, b = (replace(ours, key=key, label=key) for key in "ab")
+    results = replace(small_results(), run=replace(small_results().run, methods=(a, b)), records=tuple(pair))
+    found = {}
+    for name, asked in (("objects", None), ("lights", lights), ("few", dict.fromkeys(lights, ("one",)))):
+        ((made,),) = (pair.columns for pair in compare_pair(results, results, a, b, DEFAULT_VARIANT, lights=asked))
+        assert made.comparison is not None
+        found[name] = made.comparison
+    assert found["objects"].difference.mean == found["lights"].difference.mean == 2
+    assert found["objects"].verdict == "beats"
+    assert found["lights"].verdict == "is not told from"
+    expected = over_lights({f"s{i}": 1 + of_light[i % 8] for i in range(24)}, pair, lights)
+    assert found["lights"].difference.low == pytest.approx(expected.low, rel=1e-9)
+    assert found["few"].verdict == "is not comparable under so few lights with"
 
 
 @pytest.mark.parametrize(

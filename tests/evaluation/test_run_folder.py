@@ -14,7 +14,6 @@ from unirender_evaluation.rows import make_row, prediction_rows
 from unirender_evaluation.runs.folder import (
     missing_answers,
     say_missing,
-    say_no_rows,
     say_rows_without_values,
     unanswered,
     write_missing,
@@ -68,17 +67,6 @@ def test_a_question_without_a_value_is_not_answered(tmp_path: Path, as_folder: b
     say_missing(tmp_path, unanswered(suite, rows, scenes, []), said.append, without_files=files)
     why = " (1 more have a file, but no map that is scored there)" if as_folder else ""
     assert said == [f"mine: answers 0 of {asked} questions{why}; the others: {tmp_path / 'missing.txt'}"]
-
-
-def test_a_run_of_strangers_alone_says_that_there_is_none() -> None:
-    said: list[str] = []
-    say_no_rows(("plugins",), [make_row(UneditedInput(), "external")], said.append)
-    say_no_rows(("trivial", "plugins"), [make_row(UneditedInput(), "trivial")], said.append)
-    assert said == []
-    say_no_rows(("plugins",), [], said.append)
-    say_no_rows((), [], said.append)  # --methods without a word behind it
-    assert len(said) == 2
-    assert "there is no row of yours, and only bounds are scored; name it by --predictions" in said[0]
 
 
 def test_a_plugin_that_stands_in_no_table_is_named() -> None:

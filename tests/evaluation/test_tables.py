@@ -19,8 +19,8 @@ from unirender_evaluation.metrics import ALL_VARIANTS, METRICS, Variant, chosen_
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.statistics import UNPRINTED
 from unirender_evaluation.tables.build import Cell, Row, Table, build_table, build_tables
-from unirender_evaluation.tables.formats import format_number, print_table, to_json, to_markdown
-from unirender_evaluation.tables.latex import to_latex
+from unirender_evaluation.tables.formats import format_number, print_table, print_tables, to_json, to_markdown
+from unirender_evaluation.tables.latex import tex_text, to_latex
 from unirender_evaluation.tables.notes import NAMED
 from unirender_evaluation.tables.protocol import mask_source
 from unirender_evaluation.tables.published import check_name, published_tables
@@ -36,6 +36,7 @@ METHODS = (
 )
 RUN = RunInfo("tiny", "abcdef0123456789", 64, METHODS, coverage=0.34, lpips=("alex",), mitsuba="3.9.1", truth_spp=2048)
 LEVEL = {"ours": 21.0, "sample": 20.0, "input": 12.0, "ceiling": 45.0}
+WHOLE = Variant("whole")
 NO_BREAK = "\N{NO-BREAK SPACE}"
 MATERIAL = {"ours": 0.06, "sample": 0.07, "constant": 0.1, "ceiling": 0.0}
 
@@ -369,6 +370,34 @@ def test_latex_has_units_minus_signs_and_rows_that_are_no_options() -> None:
     assert r"{}*x & \textbf{$-$1.50}" in text
 
 
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("-0.5 dB [-1, +2]", "$-$0.5 dB [$-$1, +2]"),
+        ("1e-05 and -∞", r"1e$-$05 and $-$$\infty$"),
+        ("GPT-4, 2026-11-30, --limit 2", "GPT-4, 2026-11-30, -{}-limit 2"),
+        ("a_b & 5% #1 ${x}", r"a\_b \& 5\% \#1 \$\{x\}"),
+        ("two\n\nlines", "two lines"),
+    ],
+)
+def test_latex_shows_a_text_as_it_is(text: str, shown: str) -> None:
+    """A minus sign is none within a name or a date, and an empty line would end the caption."""
+    assert tex_text(text) == shown
+
+
+def test_a_row_without_a_value_in_any_column_is_left_out() -> None:
+    """Wonder3D is published with normals alone, and nobody answered for the others."""
+    whole = TABLES["inverse"]
+    narrow = replace(whole, columns=tuple(column for column in whole.columns if column.metric.name == "psnr"))
+    labels = {
+        len(spec.columns): {
+            r.label for r in build_table(spec, RECORDS, RUN, protocol="single-image", variant=WHOLE).rows
+        }
+        for spec in (whole, narrow)
+    }
+    assert labels[len(whole.columns)] - labels[1] == {"Wonder3D", "Constant 0.5"}
+
+
 def test_in_a_narrow_cell_what_belongs_together_stays_on_a_line() -> None:
     texts = ["Ours (n = 48)", "**26.5** ± 1.2 (n = 24)", "+5.3 [+4.6, -6.0]", "a ± b [c, d]"]
     made = [
@@ -525,6 +554,38 @@ def test_a_narrow_terminal_cuts_no_number_short(width: int) -> None:
     nothing = re.compile(r"^ ?\S+(?: \S+)* {2,}-(?: {2,}-)* *$", re.MULTILINE)
     assert not nothing.findall(text), "a row that says nothing in a part is left out of it"
     assert nothing.findall(" InPix2Pix*      -         - ")
+
+
+@pytest.mark.parametrize(("width", "blocks"), [(80, 2), (120, 1)])
+def test_groups_share_a_block_where_they_fit(width: int, blocks: int) -> None:
+    """Each block of a narrow terminal repeats all labels."""
+    spec = replace(TABLES["inverse"], columns=TABLES["inverse"].columns[:1] + TABLES["inverse"].columns[5:7])
+    found = build_table(spec, RECORDS, RUN, protocol="single-image", variant=WHOLE)
+    assert [column.group for column in found.columns] == ["Albedo", "Metallic", "Roughness"]
+    assert printed(found, width).count("Method") == blocks
+
+
+def test_what_several_tables_say_alike_is_printed_once() -> None:
+    buffer = StringIO()
+    tables = [table("whole"), table("masked")]
+    print_tables(Console(file=buffer, width=5000), tables)
+    text = buffer.getvalue()
+    assert [text.count(f"{name}: ") for name in ("variant", "suite", "truth", "exposure")] == [2, 1, 1, 1]
+    for note in {*tables[0].notes, *tables[1].notes}:
+        assert text.count(note) == 1
+    alone = StringIO()
+    print_tables(Console(file=alone, width=200), tables[:1])
+    assert alone.getvalue() == printed(tables[0])
+
+
+def test_a_table_of_texts_is_no_wider_than_its_longest_words() -> None:
+    """Rich takes as much from each wide column, and makes the table wider again where one has a long word."""
+    rows = (("an-identifier-in-one-piece", "five words are a sentence " * 2),)
+    for width in range(46, 100):
+        buffer = StringIO()
+        TextTable("Words", ("what", "said"), (rows,)).show(Console(file=buffer, width=width))
+        assert max(map(len, buffer.getvalue().splitlines())) <= width
+        assert rows[0][0] in buffer.getvalue()
 
 
 def test_a_terminal_that_is_too_narrow_for_any_table_gets_every_number() -> None:

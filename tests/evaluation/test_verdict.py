@@ -117,6 +117,13 @@ def test_a_strangers_row_has_claims_of_its_own() -> None:
     assert "FAILS  inverse/single-image albedo PSNR: theirs is beaten by mean-albedo" in text
     assert "theirs is beaten by noise-ceiling, difference -20" in text
     assert "ours" not in text
+    edits = "edit_metallic.psnr@masked-srgb-raw"
+    forms = ("composite-split-sum", "composite")
+    records += [record for name in forms for record in rows(name, edits, level, "rendering", "given")]
+    run = run_of(theirs="external", **dict.fromkeys(("input-as-albedo", *forms), "trivial"))
+    asked = [claim.a for claim in run_claims(records, run)]
+    assert asked == sorted(asked, reverse=True), "a stranger's claims are before the closed forms'"
+    assert set(asked) == {"theirs", "composite-split-sum"}
 
 
 def test_what_a_row_is_asked_is_what_the_other_answers() -> None:

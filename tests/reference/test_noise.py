@@ -307,4 +307,10 @@ def test_the_command_measures_images_and_lists_those_left_out(capsys: pytest.Cap
 @pytest.mark.parametrize("options", [{"images": 0}, {"floor": 0.0}, {"factor": 0}, {"workers": -1}])
 def test_the_command_refuses_what_makes_no_sense(options: dict) -> None:
     with pytest.raises(UsageError):
-        NoiseFloor(**options).run()
+        NoiseFloor(**options).check()
+
+
+def test_the_command_refuses_a_size_before_it_begins(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(UnirenderError, match=r"--resolution 10000000: would take .* render fewer"):
+        NoiseFloor(resolution=10_000_000).run()
+    assert capsys.readouterr().err == ""

@@ -33,7 +33,7 @@ from unirender_evaluation.runs.folder import say_missing, say_rows_without_value
 from unirender_evaluation.store import KEY_PREFIX, Store
 from unirender_evaluation.subsets import partial as partial_limit
 from unirender_evaluation.tables.build import Table
-from unirender_evaluation.tables.formats import print_table, to_json, to_markdown
+from unirender_evaluation.tables.formats import print_tables, to_json, to_markdown
 from unirender_evaluation.tables.latex import to_latex
 from unirender_evaluation.versions import LPIPS, SEPARATOR, Versions, installed_version, modules_version, versions
 from unirender_reference.folder_lock import locked, made_folder
@@ -143,8 +143,7 @@ def _run(what: PublicRun, samples: Sequence[Sample], console: Console) -> Public
     replace_file(what.out / "tables.md", "\n\n".join(map(to_markdown, tables)) + "\n")
     replace_file(what.out / "tables.tex", "\n\n".join(map(to_latex, tables)) + "\n")
     replace_file(what.out / "tables.json", to_json(tables))
-    for table in tables:
-        print_table(console, table)
+    print_tables(console, tables)
     absent = [spec.name for spec in what.public.tables if spec.name not in {record.table for record in records}]
     for line in filter(None, map(what.public.why_absent, absent)):
         say(line)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from unirender_evaluation.tables.specs import TableSpec
 
 Format = Literal["text", "markdown", "latex", "json"]
+Interval = Literal["objects", "objects-and-lights"]
 Files = Annotated[tuple[Path, ...], tyro.conf.Positional]
 
 
@@ -72,7 +73,7 @@ class BenchTables:
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """How numbers are taken: masked or whole, srgb or linear, raw, aligned or aligned_rgb, with - between
     (masked-linear), or all; repeatable. None: whole beside the published values, and masked."""
-    interval: Literal["objects", "objects-and-lights"] = "objects"
+    interval: Interval = "objects"
     """What intervals count as drawn: objects, under the suite's lights; or lights, too, which several objects share."""
     format: Format = "text"
     """What is printed."""
@@ -83,23 +84,20 @@ class BenchTables:
         from unirender_evaluation.results.file import read_results
         from unirender_evaluation.results.lights import lights_of
         from unirender_evaluation.results.merge import merge
-        from unirender_evaluation.results.schema_check import did_you_mean
-        from unirender_evaluation.table_list import ALL_TABLES
         from unirender_evaluation.tables.build import build_tables
 
-        for name in self.table:
-            if name not in ALL_TABLES:
-                raise UsageError(f"--table {name}: no such table{did_you_mean(name, ALL_TABLES)}")
+        specs = asked_specs(self.table, self.metric)
         variants = asked_variants(self.variant)
         found = [read_results(path) for path in self.files]
         run, records = merge(found)
         run, records = rows_of(run, records, self.method)
-        specs = {name: spec for name in self.table or ALL_TABLES if (spec := columns_of(ALL_TABLES[name], self.metric))}
         lights = lights_of(found) if self.interval == "objects-and-lights" else None
-        tables = [table for table in build_tables(records, run, specs, variants, lights) if table.columns]
+        tables = [table for table in build_tables(records, run, specs, variants, lights) if table.rows]
         if not tables:
-            asked = ", ".join([*(self.table or ALL_TABLES), *self.method, *self.metric])
-            raise UnirenderError(f"tables: the files have no values of {asked}; name fewer --table, --method, --metric")
+            asked = ", ".join([*(self.table or specs), *self.method, *self.metric, *self.variant])
+            raise UnirenderError(
+                f"tables: the files have no values of {asked}; name fewer --table, --method, --metric, --variant"
+            )
         _print_tables(tables, self.format)
         return 0
 
@@ -122,21 +120,30 @@ def rows_of(run: "RunInfo", records: "Sequence[Record]", methods: Sequence[str])
     return replace(run, methods=kept), [record for record in records if record.method in methods]
 
 
-def columns_of(spec: "TableSpec", metrics: Sequence[str]) -> "TableSpec | None":
-    """The table with the columns of these metrics; without names, as it is; None where it has none of them.
+def asked_specs(tables: Sequence[str], metrics: Sequence[str]) -> "dict[str, TableSpec]":
+    """These tables with the columns of these metrics; without names all. A table that has none of the columns is left
+    out.
 
     Raises:
-        UsageError: no column of any table has such a metric.
+        UsageError: there is no such table, or no column of any table has such a metric.
     """
     from unirender_evaluation.results.schema_check import did_you_mean
     from unirender_evaluation.table_list import ALL_TABLES
 
+    for name in tables:
+        if name not in ALL_TABLES:
+            raise UsageError(f"--table {name}: no such table{did_you_mean(name, ALL_TABLES)}")
     known = dict.fromkeys(column.metric.name for each in ALL_TABLES.values() for column in each.columns)
     for name in metrics:
         if name not in known:
             raise UsageError(f"--metric {name}: no column has that metric{did_you_mean(name, known)}")
-    kept = tuple(column for column in spec.columns if not metrics or column.metric.name in metrics)
-    return replace(spec, columns=kept) if kept else None
+    specs = {}
+    for name in tables or ALL_TABLES:
+        spec = ALL_TABLES[name]
+        kept = tuple(column for column in spec.columns if not metrics or column.metric.name in metrics)
+        if kept:
+            specs[name] = replace(spec, columns=kept)
+    return specs
 
 
 @dataclass(frozen=True)
@@ -175,40 +182,45 @@ class BenchCompare:
     """`results.json`, packed by gzip or not, or the folder of a run: A."""
     b: Annotated[Path, tyro.conf.Positional]
     """The same: B."""
+    table: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Only this table, as in `bench tables`; repeatable."""
     method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """KEY, a row of both files, or KEY=KEY, a row of A and one of B; repeatable."""
+    metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Only numbers of this metric, as in `bench tables`; repeatable."""
     variant: str = "masked-srgb-raw"
     """How numbers are taken, as in `bench tables`."""
+    interval: Interval = "objects"
+    """What intervals, and with them verdicts, count as drawn, as in `bench tables`."""
+    format: Format = "text"
+    """What is printed."""
 
     def run(self) -> int:
         """Prints a table for each pair of rows and each of their tables; returns 1 where nothing can be compared."""
-        from rich.console import Console
-
-        from unirender_evaluation.results.compare import chosen_pairs, compare_pair
+        from unirender_evaluation.results.compare import Compared, chosen_pairs, compare_pair
         from unirender_evaluation.results.file import read_results
-        from unirender_evaluation.results.format import comparison_table
+        from unirender_evaluation.results.format import COMPARISONS
+        from unirender_evaluation.results.lights import lights_of
         from unirender_evaluation.results.merge import differences, obstacles
-        from unirender_evaluation.tables.text import print_whole
 
-        variant = parsed(self.variant)
+        variant, specs = parsed(self.variant), asked_specs(self.table, self.metric)
         a = read_results(self.a)
         b = a if self.b == self.a else read_results(self.b)
-        found = obstacles(a, b)
-        if found:
+        if found := obstacles(a, b):
             raise UnirenderError(f"{self.a} and {self.b} cannot be compared: {'; '.join(found)}")
-        pairs = chosen_pairs(a.run, b.run, self.method)
-        console = Console()
-        facts = f"A: {a.source}\nB: {b.source}\nsuite {a.run.suite} {a.run.suite_hash[:12]}, {variant.label}"
-        console.print("\n".join([facts, *(f"note: {line}" for line in differences(a, b))]), markup=False)
-        compared = 0
-        for pair in pairs:
-            for comparison in compare_pair(a, b, *pair, variant):
-                print_whole(console, comparison_table(comparison))
-                compared += 1
-        if not compared:
+        lights = lights_of([a, b]) if self.interval == "objects-and-lights" else None
+        pairs = tuple(
+            comparison
+            for pair in chosen_pairs(a.run, b.run, self.method)
+            for comparison in compare_pair(a, b, *pair, variant, specs.values(), lights)
+        )
+        if not pairs:
             raise UnirenderError(
-                "compare: the rows share no sample of any table, expected answers to the same questions"
+                "compare: the rows share no sample of any table that is asked for, expected answers to the same "
+                "questions; name fewer --table, --metric, --variant"
             )
+        told = Compared(a.source, b.source, a.run, variant, lights is not None, tuple(differences(a, b)), pairs)
+        COMPARISONS[self.format](told)
         return 0
 
 
@@ -265,13 +277,11 @@ def _validate(path: Path) -> int:
 def _print_tables(tables: "list[Table]", kind: str) -> None:
     from rich.console import Console
 
-    from unirender_evaluation.tables.formats import print_table, to_json, to_markdown
+    from unirender_evaluation.tables.formats import print_tables, to_json, to_markdown
     from unirender_evaluation.tables.latex import to_latex
 
     if kind == "text":
-        console = Console()
-        for table in tables:
-            print_table(console, table)
+        print_tables(Console(), tables)
     elif kind == "json":
         print(to_json(tables), end="")
     else:

@@ -6,15 +6,17 @@ the difference A - B with its paired interval over objects, the verdict, and eac
 
 import difflib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from unirender.errors import UnirenderError, UsageError
 from unirender_evaluation.comparisons import (
     Comparison,
+    Lights,
     Selection,
     compare,
     misleading_exact,
+    under_other_lights,
     values_by_method,
     values_of,
 )
@@ -23,7 +25,7 @@ from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.results.data import Results
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables.build import RANKED_KINDS
-from unirender_evaluation.tables.specs import Column
+from unirender_evaluation.tables.specs import Column, TableSpec
 
 A, B = "A", "B"  # method keys of the two rows while they are compared
 
@@ -76,6 +78,29 @@ class PairComparison:
         return f"{where.table}/{where.protocol}" + ("" if where.subset == "main" else f" ({where.subset})")
 
 
+@dataclass(frozen=True)
+class Compared:
+    """What `bench compare` found.
+
+    Attributes:
+        source_a: of the first file.
+        source_b: of the second.
+        run: of the first; the second is of the same suite.
+        variant: of the numbers.
+        over_lights: whether intervals are over lights, too.
+        notes: in what else the files differ.
+        pairs: the comparisons.
+    """
+
+    source_a: str
+    source_b: str
+    run: RunInfo
+    variant: Variant
+    over_lights: bool
+    notes: tuple[str, ...]
+    pairs: tuple[PairComparison, ...]
+
+
 def chosen_pairs(a: RunInfo, b: RunInfo, methods: Sequence[str]) -> list[tuple[MethodInfo, MethodInfo]]:
     """The rows to compare: those of `methods`, each `KEY` (of both files) or `KEY=KEY` (of A, of B); without any, all
     that both files have.
@@ -102,7 +127,13 @@ def chosen_pairs(a: RunInfo, b: RunInfo, methods: Sequence[str]) -> list[tuple[M
 
 
 def compare_pair(
-    a: Results, b: Results, info_a: MethodInfo, info_b: MethodInfo, variant: Variant
+    a: Results,
+    b: Results,
+    info_a: MethodInfo,
+    info_b: MethodInfo,
+    variant: Variant,
+    specs: Iterable[TableSpec] = ALL_TABLES.values(),
+    lights: Lights | None = None,
 ) -> Iterator[PairComparison]:
     """Two rows on every table and protocol that both answered; see the module.
 
@@ -112,16 +143,18 @@ def compare_pair(
         info_a: a row of a.
         info_b: a row of b.
         variant: of the metrics, where a column does not pin it.
+        specs: the tables, with the columns that are wanted.
+        lights: of all samples: intervals and verdicts are over objects and lights. None: over objects.
     """
     present = {name: _selections(file.records, info.key) for name, file, info in ((A, a, info_a), (B, b, info_b))}
-    for spec in ALL_TABLES.values():
+    for spec in specs:
         for selection in (s for s in present[A] if s.table == spec.name and s in present[B]):
             ours, theirs = selection.of(a.records), selection.of(b.records)
             pair = [replace(r, method=A) for r in ours if r.method == info_a.key]
             pair += [replace(r, method=B) for r in theirs if r.method == info_b.key]
             columns = []
             for column in spec.columns:
-                found = _compare_column(pair, column, variant)
+                found = _compare_column(pair, column, variant, lights)
                 if found is not None:
                     ranks = {
                         "rank_a": rank(ours, a.run, column.metric, column.key(variant), info_a.key),
@@ -155,7 +188,9 @@ def rank(records: Sequence[Record], run: RunInfo, metric: Metric, key: str, meth
     return Rank(1 + sum(metric.better(other, rounded[method]) for other in rounded.values()), len(rounded))
 
 
-def _compare_column(pair: Sequence[Record], column: Column, variant: Variant) -> ColumnComparison | None:
+def _compare_column(
+    pair: Sequence[Record], column: Column, variant: Variant, lights: Lights | None
+) -> ColumnComparison | None:
     """The two rows' numbers; None where they share no sample of it."""
     key = column.key(variant)
     a, b = values_of(pair, A, key), values_of(pair, B, key)
@@ -163,11 +198,14 @@ def _compare_column(pair: Sequence[Record], column: Column, variant: Variant) ->
     if not common:
         return None
     finite = all(math.isfinite(a[sample] - b[sample]) for sample in common)
+    comparison = compare(pair, column.metric, key, A, B) if finite else None
+    if comparison is not None and lights is not None:
+        comparison = under_other_lights(comparison, pair, column.metric, lights)
     return ColumnComparison(
         column=column,
         mean_a=sum(a[sample] for sample in common) / len(common),
         mean_b=sum(b[sample] for sample in common) / len(common),
-        comparison=compare(pair, column.metric, key, A, B) if finite else None,
+        comparison=comparison,
         rank_a=None,
         rank_b=None,
         only_a=len(a.keys() - common),

@@ -8,7 +8,7 @@ from unirender_evaluation.comparisons import Lights
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables.formats import MISSING, json_number, json_text
-from unirender_evaluation.tables.latex import tex_needs, tex_row, tex_text
+from unirender_evaluation.tables.latex import text_latex
 from unirender_evaluation.tables.specs import PROTOCOLS
 from unirender_evaluation.tables.text import TextTable
 from unirender_evaluation.verdict import HEAD, Finding, judged, scale_said, summary, verdict_text
@@ -89,25 +89,8 @@ def _markdown(run: RunInfo, records: Sequence[Record], lights: Lights) -> str:
 
 
 def _latex(run: RunInfo, records: Sequence[Record], lights: Lights) -> str:
-    """A booktabs `table*`, scaled to the page where it is wider; with the stated distances it would be longer, too."""
-    table = claims_table(run, records, lights, stated=False)
-    rows = [tex_row(map(tex_text, row)) for section in table.sections for row in section]
-    below = " ".join(map(tex_text, table.notes))
-    lines = [
-        r"\begin{table*}[t]",
-        r"\centering",
-        rf"\caption{{\textbf{{{tex_text(table.title)}.}}}}",
-        r"\label{tab:verdict}",
-        r"\setlength{\tabcolsep}{4pt}",
-        r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%",
-        r"\begin{tabular}{lllrrrr}",
-        r"\toprule",
-        tex_row(map(tex_text, table.columns)),
-        *(r"\midrule", *rows, r"\bottomrule", r"\end{tabular}}"),
-        *(r"\par\smallskip", rf"\parbox{{\textwidth}}{{\scriptsize {below}}}", r"\end{table*}"),
-    ]
-    text = "\n".join(lines) + "\n"
-    return tex_needs(text) + text
+    """Without the stated distances, with which it would be longer than a page."""
+    return text_latex(claims_table(run, records, lights, stated=False), "verdict", names=3)
 
 
 VERDICTS: Mapping[str, Callable[[RunInfo, Sequence[Record], Lights], str]] = {

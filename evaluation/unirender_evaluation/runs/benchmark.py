@@ -45,7 +45,6 @@ from unirender_evaluation.runs.config import BenchConfig, anywhere, build_rows
 from unirender_evaluation.runs.folder import (
     missing_answers,
     say_missing,
-    say_no_rows,
     say_rows_without_values,
     unanswered,
     write_missing,
@@ -106,7 +105,6 @@ def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
     missing = missing_answers(suite, here.rows, here.scenes)
     write_missing(config.out, missing)
     say_missing(config.out, missing, say, "has files for")
-    say_no_rows(config.methods, here.rows, say)
     before = set(store.known)
     with progress_bar(console) as progress:
         check = run_check(request, here, store, progress, say)

@@ -15,7 +15,11 @@ from unirender_evaluation.results.commands import asked_variants
 from unirender_evaluation.subsets import STANDARD, WHOLE, Subsets
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rich.console import Console
+
+    from unirender_evaluation.tables.build import Table
 
 CLAIM = 9  # columns before a claim of the verdict: whether it holds
 
@@ -91,6 +95,8 @@ class BenchRun:
         if not self.check_scenes and (self.recheck or self.check_seed is not None):
             option = "--recheck" if self.recheck else f"--check-seed {self.check_seed}"
             raise UsageError(f"{option}: expected none with --check-scenes 0, which renders nothing again")
+        if not (self.methods or self.method or self.predictions):
+            raise UsageError("--methods: got no group, expected some of ours, optimisation, trivial and plugins")
         named_folders(self.predictions)
         asked_variants(self.variant)
 
@@ -108,7 +114,7 @@ class BenchRun:
         from unirender_evaluation.predictions.check import PredictionError
         from unirender_evaluation.runs import benchmark
         from unirender_evaluation.runs.config import BenchConfig
-        from unirender_evaluation.tables.formats import print_table
+        from unirender_evaluation.tables.formats import print_tables
 
         console = Console()
         config = BenchConfig(
@@ -139,11 +145,35 @@ class BenchRun:
         except PredictionError as error:
             print(f"unirender: error: {error}", file=sys.stderr)  # a line for each problem
             return 1
-        for table in result.tables:
-            print_table(console, table)
+        shown = shown_tables(result.tables, all_variants=bool(self.variant))
+        print_tables(console, shown)
         print_verdict(console, result.verdict)
+        if others := [table.heading for table in result.tables if table not in shown]:
+            said = f"{len(others)} more tables in {self.out / 'tables.md'} (`unirender bench tables {self.out}`): "
+            console.print(said + "; ".join(others), highlight=False, markup=False)
         console.print(f"{result.computed} new records of {len(result.records)}; report: {self.out / 'report.html'}")
         return 1 if result.truth_check.get("passed", False) is False else 0
+
+
+def shown_tables(tables: "Sequence[Table]", all_variants: bool) -> "list[Table]":
+    """What a run prints of its tables: all that a row of yours answers, and the paper's protocols, unless your row ran
+    without ours and has no answer there.
+
+    Args:
+        tables: of the run.
+        all_variants: in each variant that they have; else in the first, beside the published values where there are.
+    """
+    from unirender_evaluation.tables.specs import PROTOCOLS
+
+    first = {(table.name, table.protocol_key, table.subset): table for table in reversed(tables)}
+    kinds = [{row.kind for row in table.rows} for table in tables]
+    yours = any("external" in own for own in kinds)
+    return [
+        table
+        for table, own in zip(tables, kinds, strict=True)
+        if (all_variants or table is first[table.name, table.protocol_key, table.subset])
+        and ("external" in own or (PROTOCOLS[table.protocol_key].published and ("ours" in own or not yours)))
+    ]
 
 
 def print_verdict(console: "Console", verdict: str) -> None:

@@ -82,8 +82,8 @@ def build_rows(config: BenchConfig) -> list[Row]:
     """The rows that a configuration asks for.
 
     Raises:
-        UnirenderError: unknown group, no checkpoint, a device that is not there, broken plug-in or predictions folder,
-            two rows of one name, or one with that of a bound.
+        UnirenderError: unknown group, plug-ins alone and none is there, no checkpoint, a device that is not there,
+            broken plug-in or predictions folder, two rows of one name, or one with that of a bound.
     """
     unknown = sorted(set(config.methods) - set(GROUPS))
     if unknown:
@@ -100,6 +100,11 @@ def build_rows(config: BenchConfig) -> list[Row]:
         rows += optimized_rows(config.subsets.optimise, config.subsets.pictures, main)
     plugins = [*(installed_plugins() if "plugins" in config.methods else ()), *map(named_plugin, config.method)]
     strangers = [*plugin_rows(plugins), *prediction_rows(config.predictions)]
+    if set(config.methods) == {"plugins"} and not strangers:
+        raise UsageError(
+            "--methods plugins: got no row, since no plug-in is installed; name a method by --method FILE.py:CLASS or "
+            f"--predictions NAME=FOLDER, or one more group of {', '.join(GROUPS[:3])}"
+        )
     if "trivial" in config.methods or strangers:
         rows += trivial_rows()
     if "trivial" in config.methods:

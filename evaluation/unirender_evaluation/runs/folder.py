@@ -92,15 +92,6 @@ def say_missing(
         say(f"{label}: {what} {asked - len(questions)} of {asked} questions{why}{listed}")
 
 
-def say_no_rows(methods: Sequence[str], rows: Sequence[Row], say: Callable[[str], None]) -> None:
-    """Says that nothing but the bounds is scored, where strangers alone are asked for and there is none."""
-    if set(methods) <= {"plugins"} and not any(row.info.kind == "external" for row in rows):
-        say(
-            f"{' '.join(['--methods', *methods])}: there is no row of yours, and only bounds are scored; name it by "
-            "--predictions NAME=FOLDER or --method FILE.py:CLASS"
-        )
-
-
 def say_rows_without_values(rows: Sequence[Row], records: Sequence[Record], say: Callable[[str], None]) -> None:
     """Says which plug-ins stand in no table, since all that they returned is empty."""
     used = {record.method for record in records}

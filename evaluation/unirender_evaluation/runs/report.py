@@ -58,9 +58,10 @@ def rebuild(folder: Path, suite: str | None = None, variants: Sequence[Variant] 
             f"{error}; if the run in {folder} scored a suite of your own, give it with --suite"
         ) from error
     if loaded.sha256 != run.suite_hash:
+        to_do = "name it with --suite" if suite is None else f"leave --suite {suite} out, or name that one"
         raise UnirenderError(
-            f"suite {loaded.spec.name}: got {loaded.sha256[:12]}, expected {run.suite_hash[:12]}, which the run in "
-            f"{folder} scored; name it with --suite"
+            f"suite {loaded.spec.name}: got {loaded.sha256[:12]}, expected {run.suite} {run.suite_hash[:12]}, which "
+            f"the run in {folder} scored; {to_do}"
         )
     answers = [record for record in records if run.method(record.method).kind in RANKED_KINDS]
     if absent := Pictures(folder / "pictures", loaded, []).absent(answers):

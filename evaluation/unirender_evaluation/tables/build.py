@@ -132,6 +132,7 @@ def build_table(
     published_in = spec.name if show_published and spec.name in published_tables() else None
     measured = {info.key: _measured_row(spec, chosen, run, info, variant, lights) for info in methods}
     rows = _merge(published_tables()[published_in] if published_in else (), spec, measured)
+    rows = [row for row in rows if any(cell != Cell() for cell in row.cells)]
     total = max((row.n for row in rows), default=0)
     rows = _rank(spec, rows)
     return Table(

@@ -8,6 +8,7 @@ value that a trivial row beats, the watermark of a partial run, and the protocol
 import dataclasses
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
@@ -27,6 +28,7 @@ from unirender_evaluation.tables.text import WIDEST, markdown_row, plain_markdow
 LARGE = 1e6
 MISSING, NOT_AVAILABLE = "-", "n/a"
 NO_CELL = Cell()
+LABEL = 24  # letters of a row's label that a narrow terminal has on one line
 
 
 def format_number(value: float, decimals: int) -> str:
@@ -112,6 +114,20 @@ def json_text(content: Any) -> str:
     return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
+def print_tables(console: Console, tables: Sequence[Table]) -> None:
+    """Prints tables one after another; what the protocols of all say alike, and notes of several, once, below them."""
+    said = Counter(item for table in tables for item in dict.fromkeys(table.protocol))
+    noted = Counter(note for table in tables for note in dict.fromkeys(table.notes))
+    alike = [item for item, count in said.items() if count == len(tables) > 1]
+    shared = [note for note, count in noted.items() if count > 1]
+    for table in tables:
+        protocol = tuple(item for item in table.protocol if item not in alike)
+        notes = tuple(note for note in table.notes if note not in shared)
+        print_table(console, dataclasses.replace(table, protocol=protocol, notes=notes))
+    for line in [*([f"\nAll tables: {protocol_text(alike)}"] if alike else []), *shared]:
+        console.print(line, style="dim", highlight=False, markup=False)
+
+
 def print_table(console: Console, table: Table) -> None:
     """Prints a table to a terminal or a file, split by column groups where that is too narrow; a part has the rows that
     say something in it, and is wider where it has to be.
@@ -119,21 +135,17 @@ def print_table(console: Console, table: Table) -> None:
     if table.watermark:
         console.print(f"[bold red]{escape(table.watermark)}[/]")
     groups = [[i for i, _ in items] for _, items in groupby(enumerate(table.columns), key=lambda item: item[1].group)]
-    blocks = [[i for group in groups for i in group]]
-    if not _fits(console, table, blocks[0]):
-        blocks = [block for group in groups for block in _fitting(console, table, group)]
-    for number, indices in enumerate(blocks):
-        rich_table = _rich_table(table, indices, console.width)
+    for number, indices in enumerate(_blocks(console, table, groups)):
+        rich_table = _rich_table(table, indices)
         rich_table.title = escape(table.heading) if number == 0 else None
         print_whole(console, rich_table)
-    console.print(f"[dim]{escape(protocol_text(table.protocol))}[/]", highlight=False)
-    for note in table.notes:
-        console.print(f"[dim]{escape(note)}[/]", highlight=False)
+    for line in filter(None, (protocol_text(table.protocol), *table.notes)):
+        console.print(line, style="dim", highlight=False, markup=False)
 
 
-def _rich_table(table: Table, indices: Sequence[int], width: int) -> RichTable:
+def _rich_table(table: Table, indices: Sequence[int]) -> RichTable:
     rich_table = RichTable(box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
-    rich_table.add_column("Method", no_wrap=False, min_width=min(26, width // 3))
+    rich_table.add_column("Method")
     for i in indices:
         column, name = table.columns[i], f"{table.columns[i].group}\n{header(table.columns[i])}"
         if table.published_columns[i]:
@@ -162,23 +174,25 @@ def _rich_table(table: Table, indices: Sequence[int], width: int) -> RichTable:
     return rich_table
 
 
-def _fits(console: Console, table: Table, indices: Sequence[int]) -> bool:
-    return _rich_width(console, _rich_table(table, indices, console.width)) <= console.width
-
-
-def _fitting(console: Console, table: Table, indices: Sequence[int]) -> list[list[int]]:
-    """Columns in as few blocks as the terminal is wide enough for, at least one column in each."""
+def _blocks(console: Console, table: Table, groups: Sequence[Sequence[int]]) -> list[list[int]]:
+    """Columns in as few blocks as the terminal is wide enough for, at least one column in each; groups are kept
+    together where one fits."""
     blocks: list[list[int]] = []
-    for i in indices:
-        if blocks and _fits(console, table, [*blocks[-1], i]):
-            blocks[-1].append(i)
-        else:
-            blocks.append([i])
+    for group in groups:
+        for part in [group] if _fits(console, table, group) else [[i] for i in group]:
+            if blocks and _fits(console, table, [*blocks[-1], *part]):
+                blocks[-1] += part
+            else:
+                blocks.append([*part])
     return blocks
 
 
-def _rich_width(console: Console, rich_table: RichTable) -> int:
-    return console.measure(rich_table, options=console.options.update(max_width=WIDEST)).maximum
+def _fits(console: Console, table: Table, indices: Sequence[int]) -> bool:
+    """Whether a block's numbers fit the terminal, with labels that may be broken into lines of `LABEL` letters."""
+    rich_table = _rich_table(table, indices)
+    rich_table.columns[0].max_width = LABEL
+    wide = console.options.update(max_width=WIDEST)
+    return console.measure(rich_table, options=wide).maximum <= console.width
 
 
 def _rich_rank(text: str, rank: int | None) -> str:

@@ -1,5 +1,6 @@
 """Tables as LaTeX, in the paper's layout; what stands in them is that of the other formats (`tables.formats`)."""
 
+import re
 import textwrap
 import unicodedata
 from collections.abc import Iterable
@@ -18,6 +19,7 @@ from unirender_evaluation.tables.formats import (
     row_label,
 )
 from unirender_evaluation.tables.protocol import protocol_text
+from unirender_evaluation.tables.text import TextTable
 
 GREEK = (  # TeX's names from U+03B1 on
     "alpha beta gamma delta varepsilon zeta eta theta iota kappa lambda mu nu xi o pi rho varsigma sigma tau "
@@ -72,17 +74,38 @@ def to_latex(table: Table) -> str:
     return tex_needs(text) + text
 
 
+def text_latex(table: TextTable, label: str, names: int = 1) -> str:
+    """A table of texts likewise, its notes below; the first `names` columns to the left, numbers to the right."""
+    rows = [tex_row(map(tex_text, row)) for section in table.sections for row in section]
+    below = " ".join(map(tex_text, table.notes))
+    lines = [
+        r"\begin{table*}[t]",
+        r"\centering",
+        rf"\caption{{\textbf{{{tex_text(table.title)}.}}}}",
+        rf"\label{{tab:{label}}}",
+        r"\setlength{\tabcolsep}{4pt}",
+        r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%",
+        rf"\begin{{tabular}}{{{'l' * names}{'r' * (len(table.columns) - names)}}}",
+        r"\toprule",
+        tex_row(map(tex_text, table.columns)),
+        *(r"\midrule", *rows, r"\bottomrule", r"\end{tabular}}"),
+        *(r"\par\smallskip", rf"\parbox{{\textwidth}}{{\scriptsize {below}}}", r"\end{table*}"),
+    ]
+    text = "\n".join(lines) + "\n"
+    return tex_needs(text) + text
+
+
 def _latex_cells(row: Row, table: Table) -> list[str]:
     texts, counts = [tex_text(row_label(row, table))], cell_counts(table.rows, row)
     for i, (column, cell, doubled) in enumerate(row_cells(row, table)):
         digits = column.metric.decimals
         if doubled:
-            published = MISSING if cell.published is None else _tex_number(format_number(cell.published, digits))
+            published = MISSING if cell.published is None else tex_text(format_number(cell.published, digits))
             texts.append(_tex_rank(published, cell.published_rank) + (r"$^\dagger$" if cell.dagger else ""))
         if cell.measured is None:
             texts.append(measured_text(cell))
         else:
-            mean, spread = (_tex_number(text) for text in format_estimate(cell.measured, digits))
+            mean, spread = map(tex_text, format_estimate(cell.measured, digits))
             beside = f"{spread}{few(counts, i)}".strip()
             small = rf" {{\scriptsize {beside}}}" if beside else ""
             texts.append(_tex_rank(mean, cell.measured_rank) + small)
@@ -114,11 +137,6 @@ def _tex_rank(text: str, rank: int | None) -> str:
     return {1: rf"\textbf{{{text}}}", 2: rf"\underline{{{text}}}"}.get(rank or 0, text)
 
 
-def _tex_number(text: str) -> str:
-    text = text.replace("±", r"$\pm$").replace("∞", r"$\infty$")
-    return f"$-${text[1:]}" if text.startswith("-") and text != MISSING else text
-
-
 # Characters that mean something to TeX, or are no letters of its fonts; `--` would become a dash.
 _TEX = str.maketrans(
     {character: rf"\{character}" for character in "&%_#${}"}
@@ -136,6 +154,8 @@ _TEX = str.maketrans(
         "≥": r"$\geq$",
         "≤": r"$\leq$",
         "→": r"$\to$",
+        "↑": r"$\uparrow$",
+        "↓": r"$\downarrow$",
         "\N{MINUS SIGN}": r"$-$",
         "∞": r"$\infty$",
     }
@@ -144,9 +164,14 @@ _TEX = str.maketrans(
 )
 
 
+# The sign of a number, or of its exponent: in TeX a hyphen is shorter.
+_MINUS = re.compile(r"(?<![\w\-])-(?=[\d.∞])|(?<=\de)-(?=\d)")
+
+
 def tex_text(text: str) -> str:
-    """A text as TeX shows it as it is."""
-    return unicodedata.normalize("NFC", text).translate(_TEX).replace("--", "-{}-")
+    """A text as TeX shows it as it is, on one line."""
+    line = _MINUS.sub("\N{MINUS SIGN}", unicodedata.normalize("NFC", " ".join(text.split())))
+    return line.translate(_TEX).replace("--", "-{}-")
 
 
 def tex_needs(text: str) -> str:

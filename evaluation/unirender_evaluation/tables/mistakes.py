@@ -4,9 +4,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from unirender_evaluation.methods.mistakes import GAINS, MISTAKES
+from unirender_evaluation.methods.mistakes import GAINS, MISTAKES, PLACE
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.records import Record
+from unirender_evaluation.statistics import mean_estimate
 
 QUANTITIES = {
     "albedo": "albedo",
@@ -64,13 +65,16 @@ def _counts(of_names: Mapping[str, Sequence[Sequence[float]]]) -> str:
 
 
 def _likely(quantity: str, records: Sequence[Record]) -> dict[str, list[float]]:
-    """Mistake -> its gains that say something, of those that are probably made."""
+    """Mistake -> its gains that say something, of those that are probably made: by a large mean gain, or by a smaller
+    one that other objects would show, too."""
     found = {}
     for name, metric in GAINS.items():
         key = metric_key(quantity, metric)
         telling = [record for record in records if abs(record.values.get(key, 0.0)) > LEAST_DB]
-        gains = [record.values[key] for record in telling]
-        enough = len({record.object for record in telling}) >= FEWEST and sum(g > 0 for g in gains) > MOST * len(gains)
-        if enough and np.mean(gains) > MISTAKES[name].least:
+        gains, objects = [record.values[key] for record in telling], [record.object for record in telling]
+        if len(set(objects)) < FEWEST or sum(g > 0 for g in gains) <= MOST * len(gains):
+            continue
+        gain = mean_estimate(gains, objects)
+        if gain.mean > MISTAKES[name].least or gain.low > PLACE:
             found[name] = gains
     return found

@@ -4,7 +4,7 @@ And what all tables in Markdown need: a text that shows as it is (`plain_markdow
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from rich import box
@@ -60,16 +60,26 @@ def markdown_row(texts: Iterable[str]) -> str:
 
 
 def print_whole(console: Console, table: RichTable) -> None:
-    """Prints a table in which no word is cut short: beyond the console's width, where that is too narrow for them."""
+    """Prints a table in which no word is cut short: where the console is too narrow for whole cells the widest columns
+    are broken into lines first, and where it is too narrow for the words of all, beyond its width.
+    """
     wide = console.options.update(max_width=WIDEST)
+    least, most = [], []
     for column in table.columns:
         texts = [console.measure(text, options=wide) for text in (column.header, *column.cells)]
-        least = max(text.maximum if column.no_wrap else text.minimum for text in texts)
-        column.min_width = max(least, column.min_width or 0)
-    least = console.measure(table, options=wide).minimum
-    if least > console.width:
-        table.width = least
+        most.append(max(text.maximum for text in texts))
+        least.append(most[-1] if column.no_wrap else max(text.minimum for text in texts))
+    room = console.width - (console.measure(table, options=wide).maximum - sum(most))  # for cells
+    cap = next((cap for cap in range(max(most), 0, -1) if sum(_capped(least, most, cap)) <= room), 0)
+    for column, width in zip(table.columns, _capped(least, most, cap), strict=True):
+        column.width = width
+    table.width = console.measure(table, options=wide).maximum
     console.print(table, crop=False)
+
+
+def _capped(least: Sequence[int], most: Sequence[int], cap: int) -> list[int]:
+    """Widths of columns where none is wider than `cap`, but for its longest word."""
+    return [max(low, min(high, cap)) for low, high in zip(least, most, strict=True)]
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from unirender.errors import UsageError
 from unirender.system.worker_pool import WorkerPool
+from unirender_reference.measure.size import check_size
 from unirender_reference.processes import start_worker
 
 if TYPE_CHECKING:
@@ -119,12 +120,13 @@ class NoiseFloor:
     workers: int = 0
     """Processes; 0: one for each core."""
 
-    def run(self) -> int:
-        """Returns the exit status: 1 where a floor was missed or the estimates are biased."""
-        from rich.console import Console
+    def check(self) -> None:
+        """Looks at the values.
 
-        from unirender.system.run_progress import progress_bar
-
+        Raises:
+            UsageError: one is outside its range.
+            UnirenderError: the machine has not the memory for the resolution.
+        """
         for name in ("images", "factor", "resolution", "limit"):
             if getattr(self, name) < 1:
                 raise UsageError(f"--{name} {getattr(self, name)}: expected at least 1")
@@ -132,6 +134,15 @@ class NoiseFloor:
             raise UsageError(f"--floor {self.floor:g}: expected decibels above 0 and below 100")
         if self.workers < 0 or self.seed < 0:
             raise UsageError(f"--workers {self.workers}, --seed {self.seed}: expected 0 or more")
+        check_size(self.resolution)
+
+    def run(self) -> int:
+        """Returns the exit status: 1 where a floor was missed or the estimates are biased."""
+        self.check()
+        from rich.console import Console
+
+        from unirender.system.run_progress import progress_bar
+
         rows: list[FloorRow] = []
         with progress_bar(Console(stderr=True)) as bar:
             task = bar.add_task("images", total=self.images)

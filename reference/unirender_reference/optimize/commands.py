@@ -234,11 +234,13 @@ class Optimize:
 
             began = time.perf_counter()
             start = None if predict is None else predict(given.image, given.mask, given.camera)
+            priors, trust = self.single.resolved(obj is not None, start is not None)
+            config = dataclasses.replace(self.single, priors=priors, trust=trust)
             found = optimize_image(
                 given.image,
                 given.mask,
                 given.camera,
-                self.single,
+                config,
                 normal=given.normal,
                 geometry=obj,
                 init=start,
@@ -249,8 +251,6 @@ class Optimize:
             seconds = time.perf_counter() - began
             again = rerendered(given, found, obj, self.input.name)
             meta = {"command": "optimize", "input": self.input, "init": self.init, "hdr": given.hdr, "mesh": self.mesh}
-            priors, trust = self.single.resolved(obj is not None, start is not None)
-            config = dataclasses.replace(self.single, priors=priors, trust=trust)
             meta |= {"psnr_db": again.psnr_db, "config": dataclasses.asdict(config)}
             with writing(self.out, ELSEWHERE):
                 write_result(folder, found, meta, again.image_linear)

@@ -125,6 +125,12 @@ def test_bad_options_are_refused(options: dict, tmp_path: Path) -> None:
         BenchDerivedLight(out=tmp_path, **options).check()
 
 
+def test_a_size_is_refused_before_anything_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(UnirenderError, match=r"--resolution 10000000: would take .* render fewer"):
+        BenchDerivedLight(out=tmp_path, resolution=10_000_000).run()
+    assert capsys.readouterr().err == ""
+
+
 def test_an_unknown_light_is_named(tmp_path: Path) -> None:
     with pytest.raises(UnirenderError, match="'moon': not bundled"):
         DerivedLight(tmp_path, ("moon",), (), (0.3,), 24, VERSIONS)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from unirender.command_line.option_checks import at_least
 from unirender.errors import UsageError
+from unirender_reference.measure.size import check_size
 
 LEAST_SIZE = 8
 
@@ -40,6 +41,7 @@ class BenchDerivedLight:
 
         Raises:
             UsageError: one is outside its range, or given twice.
+            UnirenderError: the machine has not the memory for the resolution.
         """
         at_least(LEAST_SIZE, resolution=self.resolution)
         given = {"lights": self.lights, "roughness": self.roughness, "objects": self.objects}
@@ -51,6 +53,7 @@ class BenchDerivedLight:
                 raise UsageError(f"--roughness {value:g}: expected numbers in [0, 1]")
         for seed in self.objects:
             at_least(0, objects=seed)
+        check_size(self.resolution)
 
     def run(self) -> int:
         """Measures what is missing, prints and writes `derived_light.md` and `.json`; returns the exit status."""
