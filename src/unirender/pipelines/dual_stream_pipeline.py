@@ -73,10 +73,8 @@ class DualStreamPipeline(DiffusionPipeline):
         self.register_to_config(material=material, calibration=check_lines(calibration))
         self.dual_stream: DualStreamModel
         self.scheduler: SchedulerMixin
-        codec = make_codec(dual_stream.config["codec"], dual_stream.config["patch"], vae)
-        self.conditioning = Conditioning.of(dict(dual_stream.config), codec)
+        self.vae: AutoencoderKL | None
         self.conditioning.check_channels(dict(dual_stream.config))
-        self.size = dual_stream.config["sample_size"] * codec.factor
         self._reported: set[str] = set()  # maps whose overflow was logged
 
     @classmethod
@@ -107,6 +105,23 @@ class DualStreamPipeline(DiffusionPipeline):
         # Faster on a CPU, most so in batches.
         pipeline.dual_stream.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] - diffusers' own
         return pipeline
+
+    @property
+    def components(self) -> dict[str, Any]:
+        """What the class takes to make this pipeline again: its parts and its settings, which decide answers, too."""
+        return super().components | {name: self.config[name] for name in ("material", "calibration")}
+
+    # Of the network that is there: users of diffusers exchange parts of a pipeline.
+    @property
+    def conditioning(self) -> Conditioning:
+        """How maps enter the network."""
+        config = dict(self.dual_stream.config)
+        return Conditioning.of(config, make_codec(config["codec"], config["patch"], self.vae))
+
+    @property
+    def size(self) -> int:
+        """Side of the network's own square, pixels."""
+        return self.dual_stream.config["sample_size"] * self.conditioning.codec.factor
 
     @property
     def size_multiple(self) -> int:
