@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
+from unirender.shown import short_repr
 from unirender_reference.backend import mitsuba
 from unirender_reference.faults import ObjectFault
 from unirender_reference.integrators import path_integrator
@@ -48,6 +49,8 @@ class Estimate:
     mean: Float[np.ndarray, "h w c"]
     variance: Float[np.ndarray, "h w c"] | None
     nan_pixels: int = 0
+
+    __repr__ = short_repr
 
 
 @dataclass

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from unirender.blocks import by_rows
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
+from unirender.shown import in_short
 from unirender.vectors import lengths
 
 MAPS: dict[str, int] = {
@@ -100,9 +101,7 @@ class Intrinsics:
             _check_range(name, value)
 
     def __repr__(self) -> str:
-        maps = [
-            f"{name} {list(value.shape)} in [{value.min():.3g}, {value.max():.3g}]" for name, value in self.maps.items()
-        ]
+        maps = [f"{name} {in_short(value)}" for name, value in self.maps.items()]
         return f"Intrinsics({', '.join([*maps, repr(self.camera)])})"
 
     @property
