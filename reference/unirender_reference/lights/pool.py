@@ -62,7 +62,8 @@ class LightPool:
         Raises:
             UnirenderError: as `load_light`.
         """
-        light = load_light(self.folder / name, shape=(self.height, 2 * self.height))
+        photograph = Path(name).suffix.lower() not in HDR_SUFFIXES
+        light = load_light(self.folder / name, photograph, (self.height, 2 * self.height))
         return Light(re.sub(r"[^\w-]", "-", name), light.environment, {**light.provenance, "file": name})
 
     def draw(self, rng: np.random.Generator) -> Light:

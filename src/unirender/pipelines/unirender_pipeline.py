@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
+from unirender.arguments import check_switches
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.diffusion.sampling import Generators
@@ -50,7 +51,6 @@ from unirender.pipelines.settings import (
     Sampling,
     check_material,
     check_settings,
-    check_switches,
     list_cameras,
     same_noise,
     step_end_of,
@@ -287,7 +287,12 @@ class UniRenderPipeline(DualStreamPipeline):
 
         Returns:
             By name of the map; {} where nothing does.
+
+        Raises:
+            UnirenderError: as `render`.
         """
+        check_rendered(intrinsics, ())
+        check_switches(shadows=shadows)
         network = self._network()
         return network.overflow(enter(network, ready_to_render(intrinsics, shadows))[1])
 
