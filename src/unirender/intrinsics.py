@@ -172,7 +172,11 @@ def as_numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
             raise UnirenderError(
                 f"{name}: got a tensor that is no array ({error}), expected value.detach().float().cpu().numpy()"
             ) from error
-        raise UnirenderError(f"{name}: got {type(value).__name__} {value!r:.60}, expected numbers") from error
+        kind = type(value).__name__
+        if isinstance(getattr(value, name, None), np.ndarray):
+            raise UnirenderError(f"{name}: got {kind}, expected numbers; it has some as its `{name}`") from error
+        got = f"of {value.dtype} values" if isinstance(value, np.ndarray) else f"{value!r:.60}"
+        raise UnirenderError(f"{name}: got {kind} {got}, expected numbers") from error
 
 
 def as_radiance(name: str, value: Any) -> Float[np.ndarray, "..."]:

@@ -49,6 +49,7 @@ mask[4:-4, 4:-4] = 1
 image = np.full((16, 24, 3), 0.5, np.float32)
 decomposition = pipeline.decompose(image, mask)
 light = np.ones((16, 32, 3), np.float32)
+sky = Light('a', light)
 renderer = Renderer(make_object(1, 'train'), resolution=8)
 maps, bytes_8 = decomposition.intrinsics, (200 * light).astype(np.uint8)
 photograph = Image.fromarray(bytes_8)
@@ -82,6 +83,16 @@ CASES = {
     "pipeline.edit(image, mask, roughness=[0.2, 0.3])": "roughness: got shape (2,), expected one number",
     "pipeline.edit(image, mask, metallic=np.zeros(0))": "metallic: got shape (0,), expected one number",
     "pipeline.edit(image, mask, metallic='gold')": "metallic: got str 'gold', expected numbers",
+    "pipeline.edit(image, mask, roughness=True)": "roughness: got True, expected one number in [0, 1], or a map",
+    "pipeline.edit(image, mask, metallic=np.bool_(1))": "metallic: got True, expected one number in [0, 1], or a map",
+    "pipeline.decompose(image.astype(np.uint16), mask)": "image: got uint16 values, expected floats in [0, 1]; divide",
+    "pipeline.overflow(decomposition)": "render: got Decomposition, expected unirender.intrinsics.Intrinsics; it",
+    "shade(maps, sky)": "environment: got Light, expected numbers; it has some as its `environment`",
+    "Intrinsics(albedo=np.full((2, 2, 3), '0.5'))": "albedo: got ndarray of <U3 values, expected numbers",
+    "write_png('not_made.png', np.nan * image)": "picture: got NaN or infinite values, expected display values",
+    "load_light('docs/_static/example.png', photograph='no')": "photograph: got 'no', expected True or False",
+    "load_light('docs/_static/example.png', normalise=None)": "normalise: got None, expected True or False",
+    "score(decomposition, decomposition)": "score: got Decomposition, expected unirender.intrinsics.Intrinsics; it has",
     "pipeline.edit(image, mask, metallic='0.2')": "metallic: got str '0.2', expected numbers",
     "pipeline.render(decomposition)": "render: got Decomposition, expected unirender.intrinsics.Intrinsics; it has one",
     "export_scene(maps, 'scene')": "folder: got Intrinsics Intrinsics(albedo",
@@ -192,6 +203,8 @@ FINE = (
     "pipeline.decompose_batch(iter([image, image]), iter([mask, mask]))",
     "unpremultiply(np.stack([image, image]), mask)",
     "unpremultiply(image, (mask > 0.5).astype(np.uint8))",
+    "pipeline.edit(image, mask, metallic=mask > 0.5, decomposition=decomposition)",
+    "score(image, image, 'masked', mask=mask > 0.5)",
 )
 
 

@@ -79,8 +79,11 @@ def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"]
         raise UnirenderError(
             f"image: got shape {picture.shape}, expected [height, width, 3]; {_shape_advice(picture.shape)}"
         )
-    if picture.dtype == np.uint8:
-        raise UnirenderError("image: got uint8 values, expected floats in [0, 1]; divide by 255, or pass a PIL picture")
+    if picture.dtype.kind == "u":
+        raise UnirenderError(
+            f"image: got {picture.dtype} values, expected floats in [0, 1]; divide by {np.iinfo(picture.dtype).max}, "
+            "or pass a PIL picture"
+        )
     if min(picture.shape[:2]) < MIN_SIDE:
         raise UnirenderError(f"image: got {picture.shape[:2]} pixels, expected at least {MIN_SIDE} along each side")
     picture = _checked("image", picture, RANGE_ADVICE)
@@ -290,6 +293,8 @@ def as_material(name: str, value: Any, mask: Float[np.ndarray, "h w 1"]) -> Floa
     Raises:
         UnirenderError: it is no number, outside [0, 1], or of another size.
     """
+    if isinstance(value, bool | np.bool_):
+        raise UnirenderError(f"{name}: got {value}, expected one number in [0, 1], or a map")
     given = as_numbers(name, value)
     if given.size != 1 and given.shape not in (mask.shape, mask.shape[:2]):
         raise UnirenderError(
