@@ -590,7 +590,7 @@ USAGE = {
     "no such command": (["bake"], "bake"),
     "nothing to change": (["edit", "PICTURE", "--output", "OUT"], "nothing to change"),
     "metallic": (["edit", "PICTURE", "--output", "OUT", "--metallic", "nan"], "[0, 1]"),
-    "fov": (["decompose", "PICTURE", "--output", "OUT", "--fov", "190"], "field of view"),
+    "fov": (["decompose", "PICTURE", "--output", "OUT", "--fov", "190"], "--fov 190: expected degrees"),
     "samples": (["decompose", "PICTURE", "--output", "OUT", "--samples", "0"], "at least 1"),
     "steps": (["render", "FOLDER", "--output", "OUT", "--steps", "0"], "expected 1 to 500"),
     "seed": (["render", "FOLDER", "--output", "OUT", "--seed", "99999999999999999999"], "64 bits"),

@@ -127,7 +127,7 @@ def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path)
     assert full.value.filename == str(out)
     assert (out / "a").read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    with pytest.raises(UnirenderError, match="or pass --overwrite"), new_folder(out, overwrite=False):
+    with pytest.raises(UnirenderError, match="or overwrite it"), new_folder(out, overwrite=False):
         pass
     (out / "meta.json").unlink()
     with pytest.raises(UnirenderError, match=r"no meta\.json"), new_folder(out, overwrite=True):

@@ -187,6 +187,7 @@ CASES = {
     "UniRenderPipeline.from_pretrained(123)": "checkpoint: got 123, expected the path of a pipeline folder",
     "pipeline.render(maps, derived='shadow')": "derived: got shadow, expected names out of",
     "pipeline.edit(image, mask, metallic=1.0, decomposition=maps)": "decomposition: got Intrinsics, expected the",
+    "Camera(200)": "field of view: got 200 degrees, expected a vertical angle between 0 and 180",
     "Camera('36')": "camera: got Camera(fov_deg='36'",
     "Camera(36, None)": "camera: got Camera(fov_deg=36, principal=None)",
     "Camera(36, 'ab')": "camera: got Camera(fov_deg=36, principal='ab')",
