@@ -138,7 +138,7 @@ def folder_beside(path: str | Path, output: str | Path, temporary: Path, *, over
 
 
 def write_result(
-    folder: Path,
+    folder: str | Path,
     intrinsics: Intrinsics | None,
     meta: Mapping[str, Any],
     image_linear: Float[np.ndarray, "h w 3"] | None = None,
@@ -154,9 +154,13 @@ def write_result(
             added.
         image_linear: a rendered image, premultiplied; written as `image.exr` and `image.png` (with alpha if the mask is
             known).
+
+    Raises:
+        UnirenderError: the maps are no `Intrinsics`, or the folder is no path.
     """
     if intrinsics is not None:
         as_instance(intrinsics, Intrinsics, "result")
+    folder = as_path(folder, "folder")
     attributes = header_attributes(meta, None if intrinsics is None else intrinsics.camera)
     if intrinsics is not None:
         if any(name in IMAGE_MAPS for name in intrinsics.present):

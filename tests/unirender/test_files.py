@@ -395,7 +395,7 @@ def test_an_environment_from_elsewhere_is_not_taken_for_one_of_ours(tmp_path: Pa
     """Its rows are areas, ours lie on the poles: taken as it is, light from above would be weighed wrongly."""
     mask = np.ones((8, 8, 1), dtype=np.float32)
     light = np.ones((8, 16, 3), dtype=np.float32)
-    write_result(tmp_path, Intrinsics(mask=mask, roughness=mask, environment=light, camera=Camera()), {})
+    write_result(str(tmp_path), Intrinsics(mask=mask, roughness=mask, environment=light, camera=Camera()), {})
     assert read_result(tmp_path).environment is not None
     write_exr(tmp_path / "environment.exr", image_channels(light))
     with pytest.raises(UnirenderError, match=r"environment\.exr: is no environment that .*--environment"):

@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from diffusers.utils import logging
 from unirender.camera import Camera
-from unirender.color import image_srgb, srgb_decode, unpremultiply
+from unirender.color import display_slope, image_srgb, srgb_decode, unpremultiply
 from unirender.composite import composite_image
 from unirender.light.exposure import exposure_factor
 from unirender.exr import read_exr, write_exr
 from unirender.files import map_picture, read_result, write_png, write_result
 from unirender.intrinsics import Intrinsics
-from unirender.pictures import read_picture
+from unirender.pictures import Picture, read_picture
 from PIL import Image
 from unirender.light.environment import has_bright_pole, resample_environment, rotate_environment, sample_environment
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
@@ -32,7 +32,7 @@ from unirender_evaluation.scoring import score_maps
 from unirender_evaluation.suites.suite import load_suite
 from unirender_reference.denoise import denoise
 from unirender_reference.effects import render_effects
-from unirender_reference.lights import Light, load_light, make_light
+from unirender_reference.lights import Light, light_pool, load_light, make_light
 from unirender_reference.lights.light import area_resampled
 from unirender_reference.meshes import load_mesh
 from unirender_reference.multiview import orbit, pose_towards
@@ -89,6 +89,11 @@ CASES = {
     "pipeline.overflow(decomposition)": "render: got Decomposition, expected unirender.intrinsics.Intrinsics; it",
     "shade(maps, sky)": "environment: got Light, expected numbers; it has some as its `environment`",
     "Intrinsics(albedo=np.full((2, 2, 3), '0.5'))": "albedo: got ndarray of <U3 values, expected numbers",
+    "pipeline.decompose(Picture(image, mask, 'a.png'))": "image: got a Picture, expected its image_srgb, and its mask",
+    "write_result(3, maps, {})": "folder: got int 3, expected a path",
+    "export_scene('not_made', maps, overwrite='no')": "overwrite: got 'no', expected True or False",
+    "light_pool('docs/_static', 'train', turn='no')": "turn: got 'no', expected True or False",
+    "display_slope(image, 'sRGB')": "space: got 'sRGB', expected 'srgb' or 'linear'",
     "write_png('not_made.png', np.nan * image)": "picture: got NaN or infinite values, expected display values",
     "load_light('docs/_static/example.png', photograph='no')": "photograph: got 'no', expected True or False",
     "load_light('docs/_static/example.png', normalise=None)": "normalise: got None, expected True or False",

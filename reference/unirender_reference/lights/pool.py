@@ -19,6 +19,7 @@ from typing import Literal
 
 import numpy as np
 
+from unirender.arguments import check_switches
 from unirender.errors import UnirenderError
 from unirender_reference.lights.files import HDR_SUFFIXES, load_light
 from unirender_reference.lights.light import SHAPE, Light
@@ -122,6 +123,7 @@ def light_pool(
     Raises:
         UnirenderError: no such folder, no places for this side of the division, or a number outside its range.
     """
+    check_switches(turn=turn)
     if split not in ("train", "test"):
         raise UnirenderError(f"light_pool: got split {split!r}, expected 'train' or 'test'")
     if not 0 < share <= 1:

@@ -14,7 +14,7 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import RANGE_TOLERANCE, Intrinsics, as_numbers
 from unirender.light.environment import as_light, is_twice_as_wide
 from unirender.picture_files.display_files import display_colors, display_values, is_turned
-from unirender.pictures import coverage
+from unirender.pictures import Picture, coverage
 from unirender.pipelines.bounced_light import WHITE_SKY, bounced_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.framing import thumbnail
@@ -70,6 +70,8 @@ def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"]
         picture, alpha = values[..., :3], values[..., 3:] if values.shape[-1] == 4 else None
     elif isinstance(image, np.ndarray):
         picture, alpha = image, None
+    elif isinstance(image, Picture):
+        raise UnirenderError("image: got a Picture, expected its image_srgb, and its mask as the mask")
     else:
         raise UnirenderError(
             f"image: got {type(image).__name__}, expected a numpy array [h w 3] or a PIL picture; a file is read by "
