@@ -29,6 +29,7 @@ DERIVABLE = ("specular", "diffuse")  # from a light
 MIN_SIDE = 8  # pixels
 MASK_TOLERANCE = 1 / 255  # between masks that are the same but for the 8 bits of a file
 PICTURE_TOLERANCE = 2 / 255  # between display values times such masks that are the same but for these 8 bits
+MANY_AWAY = 0.2  # share of the object's normals, from which it is told
 RANGE_ADVICE = "divide 8 bits by 255 and 16 bits by 65535; tone-map or clip radiance"
 
 logger = logging.getLogger(__name__)
@@ -275,6 +276,17 @@ def with_mask(intrinsics: Intrinsics) -> Intrinsics:
     if not surface.any():
         surface = np.ones((intrinsics.height, intrinsics.width, 1))
     return intrinsics.replace(mask=surface.astype(np.float32))
+
+
+def report_facing_away(intrinsics: Intrinsics) -> None:
+    """Logs that many of the normals face away from the camera: mostly they have other axes."""
+    share = facing_away(with_mask(intrinsics))
+    if share > MANY_AWAY:
+        logger.warning(
+            "%.0f%% of the object's normals face away from the camera: expected camera axes, +z towards the viewer; "
+            "maps of other axes have to be turned",
+            100 * share,
+        )
 
 
 def facing_away(intrinsics: Intrinsics) -> float:

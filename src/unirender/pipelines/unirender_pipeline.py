@@ -42,6 +42,7 @@ from unirender.pipelines.inputs import (
     check_decomposition,
     check_rendered,
     ready_to_render,
+    report_facing_away,
     told_derived,
 )
 from unirender.pipelines.network import Overflow
@@ -273,6 +274,7 @@ class UniRenderPipeline(DualStreamPipeline):
         how = Sampling.of(mode, num_inference_steps, num_samples, generator, step_end=step_end)
         network = self._network(mode, sampler, size)
         (image,) = render_any_size(network, [intrinsics], how, self._report_overflow, derived, shadows)
+        report_facing_away(intrinsics)
         self.maybe_free_model_hooks()
         return image
 
