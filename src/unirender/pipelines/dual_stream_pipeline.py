@@ -75,7 +75,7 @@ class DualStreamPipeline(DiffusionPipeline):
         self.scheduler: SchedulerMixin
         self.vae: AutoencoderKL | None
         self.conditioning.check_channels(dict(dual_stream.config))
-        self._reported: set[str] = set()  # maps whose overflow was logged
+        self._reported: set[str] = set()  # of what something was logged
 
     @classmethod
     def from_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride] - a path may be left out here
@@ -164,6 +164,9 @@ class DualStreamPipeline(DiffusionPipeline):
 
     def _report_overflow(self, overflow: dict[str, Overflow]) -> None:
         for name, over in overflow.items():
-            if name not in self._reported:
-                self._reported.add(name)
-                logger.warning("%s: %s; they are kept, but what it makes of them is a guess", name, over)
+            self._report_once(name, f"{over}; they are kept, but what it makes of them is a guess")
+
+    def _report_once(self, name: str, remark: str) -> None:
+        if name not in self._reported:
+            self._reported.add(name)
+            logger.warning("%s: %s", name, remark)

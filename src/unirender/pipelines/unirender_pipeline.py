@@ -104,7 +104,7 @@ class UniRenderPipeline(DualStreamPipeline):
         Args:
             image_srgb: display values [h w 3] in [0, 1], not premultiplied, or a PIL picture (an EXIF orientation is
                 not applied, and logged).
-            mask: coverage [h w 1] in [0, 1]; None: a PIL picture's alpha, else the whole frame.
+            mask: coverage [h w 1] in [0, 1]; None: a PIL picture's alpha, else the whole frame, which is logged once.
             camera: the contract's default if None.
             mode: `mean` (one step, the expectation) or `sample` (diffusion samples: their mean and spread).
             num_inference_steps: of `sample`; 20 if None.
@@ -212,7 +212,7 @@ class UniRenderPipeline(DualStreamPipeline):
         network = self._network(mode, sampler, size)
         views, thumbnails = [], []
         for image, mask, camera in zip(images_srgb, masks, cameras, strict=True):
-            picture, cover = as_picture(image, mask)
+            picture, cover = self._picture(image, mask)
             views.append(View(srgb_decode(picture) * cover, cover, camera))
             thumbnails.append(thumbnail(picture, cover))
         lines = self.config["calibration"]
@@ -332,7 +332,7 @@ class UniRenderPipeline(DualStreamPipeline):
         check_settings(sampling, anchored=anchored)
         if roughness is None and metallic is None:
             raise UnirenderError("edit: nothing to change, expected roughness or metallic (or both)")
-        picture, cover = as_picture(image_srgb, mask)
+        picture, cover = self._picture(image_srgb, mask)
         decomposition = self._decomposition(picture, cover, decomposition, sampling)
         before = decomposition.with_network_light
         edited, bounded, coarse = before, 0.0, None
@@ -391,7 +391,7 @@ class UniRenderPipeline(DualStreamPipeline):
         if environment is None and (specular is None or diffuse is None):
             raise UnirenderError("relight: no light, expected an environment, or both specular and diffuse")
         check_exposure(exposure)
-        picture, cover = as_picture(image_srgb, mask)
+        picture, cover = self._picture(image_srgb, mask)
         if environment is not None:
             environment = as_environment(environment)
         decomposition = self._decomposition(picture, cover, decomposition, sampling)
@@ -405,6 +405,12 @@ class UniRenderPipeline(DualStreamPipeline):
         derived = told_derived(missing, shadows)
         image = self._rerender(picture, cover, before, edited, anchored, sampling, derived)
         return EditResult(image, edited, decomposition)
+
+    def _picture(self, image: Any, mask: Any) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"]]:
+        picture, cover = as_picture(image, mask)
+        if mask is None and cover.min() == 1:
+            self._report_once("mask", "not given, nor an alpha channel: the whole frame is taken as the object")
+        return picture, cover
 
     def _decomposition(
         self,
