@@ -27,7 +27,7 @@ from unirender.light.environment import has_bright_pole, resample_environment, r
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.scene_export import export_scene
 from unirender.light.surface_light import diffuse_light, specular_light
-from unirender_evaluation import read_results, score
+from unirender_evaluation import Variant, read_results, score
 from unirender_evaluation.scoring import score_maps
 from unirender_evaluation.suites.suite import load_suite
 from unirender_reference.denoise import denoise
@@ -97,6 +97,7 @@ CASES = {
     "write_png('not_made.png', np.nan * image)": "picture: got NaN or infinite values, expected display values",
     "load_light('docs/_static/example.png', photograph='no')": "photograph: got 'no', expected True or False",
     "load_light('docs/_static/example.png', normalise=None)": "normalise: got None, expected True or False",
+    "score(maps, maps, Variant(space='sRGB'))": "variant: got space 'sRGB', expected one of srgb, linear",
     "score(decomposition, decomposition)": "score: got Decomposition, expected unirender.intrinsics.Intrinsics; it has",
     "pipeline.edit(image, mask, metallic='0.2')": "metallic: got str '0.2', expected numbers",
     "pipeline.render(decomposition)": "render: got Decomposition, expected unirender.intrinsics.Intrinsics; it has one",
