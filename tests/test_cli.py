@@ -27,6 +27,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.pipelines.editing import under_light
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
+from unirender_reference.lights import load_light
 
 DECOMPOSED = {"intrinsics.exr", "environment.exr", "meta.json"} | {
     f"{name}.png"
@@ -554,10 +555,14 @@ def test_negative_radiance_of_a_light_is_told(tmp_path: Path, capsys: pytest.Cap
     assert "of its radiance is negative and was set to 0" in capsys.readouterr().err
 
 
-def test_a_light_that_is_taken_as_a_photograph_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_light_that_is_taken_as_a_photograph_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     Image.new("RGB", (64, 32), (200, 180, 160)).save(tmp_path / "panorama.jpg")
+    for photograph in (True, False):  # asked for
+        load_light(tmp_path / "panorama.jpg", photograph)
+    assert not caplog.messages
     assert read_light(tmp_path / "panorama.jpg").shape == (128, 256, 3)
-    assert "panorama.jpg: taken as a photograph" in capsys.readouterr().err
+    (message,) = caplog.messages
+    assert "panorama.jpg: taken as a photograph" in message
 
 
 @pytest.mark.parametrize(
@@ -585,7 +590,7 @@ USAGE = {
     "no such command": (["bake"], "bake"),
     "nothing to change": (["edit", "PICTURE", "--output", "OUT"], "nothing to change"),
     "metallic": (["edit", "PICTURE", "--output", "OUT", "--metallic", "nan"], "[0, 1]"),
-    "fov": (["decompose", "PICTURE", "--output", "OUT", "--fov", "190"], "field of view"),
+    "fov": (["decompose", "PICTURE", "--output", "OUT", "--fov", "190"], "--fov 190: expected degrees"),
     "samples": (["decompose", "PICTURE", "--output", "OUT", "--samples", "0"], "at least 1"),
     "steps": (["render", "FOLDER", "--output", "OUT", "--steps", "0"], "expected 1 to 500"),
     "seed": (["render", "FOLDER", "--output", "OUT", "--seed", "99999999999999999999"], "64 bits"),

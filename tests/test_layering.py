@@ -35,6 +35,7 @@ VOCABULARY = {
         "picture_files.sixteen_bits",
         "pictures",
         "score",
+        "shown",
         "system.machine",
         "system.run_progress",
         "system.whole_files",

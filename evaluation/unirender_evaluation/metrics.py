@@ -27,6 +27,7 @@ Scale = Literal["raw", "aligned", "aligned_rgb"]
 MASKS: tuple[Mask, ...] = ("masked", "whole")
 SPACES: tuple[Space, ...] = ("srgb", "linear")
 SCALES: tuple[Scale, ...] = ("raw", "aligned", "aligned_rgb")
+AXES = {"mask": MASKS, "space": SPACES, "scale": SCALES}  # of a `Variant`
 LPIPS_SCALES: tuple[Scale, ...] = ("raw",)  # those that runs compute: with others, scoring takes half as long again
 
 HIGHER, LOWER = True, False  # is better: `Metric.higher_is_better`, as tables of metrics say it
@@ -48,6 +49,11 @@ class Variant:
     space: Space = "srgb"
     scale: Scale = "raw"
 
+    def __post_init__(self) -> None:
+        for axis, words in AXES.items():
+            if (word := getattr(self, axis)) not in words:
+                raise UnirenderError(f"variant: got {axis} {word!r:.60}, expected one of {', '.join(words)}")
+
     @property
     def label(self) -> str:
         return f"{self.mask}-{self.space}-{self.scale}"
@@ -61,7 +67,7 @@ class Variant:
         """
         axes: dict[str, str] = {}
         for word in text.split("-"):
-            found = [axis for axis, words in (("mask", MASKS), ("space", SPACES), ("scale", SCALES)) if word in words]
+            found = [axis for axis, words in AXES.items() if word in words]
             if not found or found[0] in axes:
                 known = ", ".join((*MASKS, *SPACES, *SCALES))
                 raise UnirenderError(

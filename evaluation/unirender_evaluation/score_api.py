@@ -38,8 +38,8 @@ def score(
         truth: the same kind, of the same size. Maps that either side lacks get no values; `Intrinsics` need a mask.
         protocol: how numbers are taken: "masked-srgb-raw", "whole-linear-aligned" and so on (what is left out is
             masked, srgb, raw), or a `Variant`; None: every variant at once.
-        mask: coverage (h, w, 1) of a true picture, in [0, 1]; `np.ones((h, w, 1))` where all of it counts. Not for
-            `Intrinsics`, which have their own.
+        mask: coverage (h, w, 1) of a true picture, in [0, 1] or as booleans; `np.ones((h, w, 1))` where all of it
+            counts. Not for `Intrinsics`, which have their own.
         lpips: backbones to compute, "alex" or "vgg". They need torch and take longer than all else together.
         quantity: what a picture's keys begin with.
 
@@ -63,6 +63,9 @@ def score(
         "lpips": _networks(lpips),
         "lpips_scales": ("raw" if variant is None else variant.scale,),
     }
+    for each in (prediction, truth):
+        if isinstance(getattr(each, "intrinsics", None), Intrinsics):
+            as_instance(each, Intrinsics, "score")
     if isinstance(prediction, Intrinsics) != isinstance(truth, Intrinsics):
         got = f"{type(prediction).__name__} and {type(truth).__name__}"
         raise UnirenderError(f"score: got {got}, expected two unirender.Intrinsics or two pictures")
@@ -132,6 +135,8 @@ def _picture(value: Any, what: str) -> Picture:
 
 
 def _mask(value: Any, truth: Picture) -> Float[np.ndarray, "h w 1"]:
+    if isinstance(value, np.ndarray) and value.dtype == bool:
+        value = value.astype(np.float32)
     found = _array(value, "mask", 1, "coverage in [0, 1]")
     if found.shape[:2] != truth.shape[:2]:
         raise UnirenderError(

@@ -85,12 +85,13 @@ COMMANDS = (
 )
 FROM_RECORDS = ("ceiling", "claims", "comparisons", "statistics", "table_list", "verdict")
 # Of the shared vocabulary's folder: the docstrings of its packages, the command line, names of checkpoints, processes,
-# and what is said of errors.
+# and what is said of errors and shown of objects.
 OUTSIDE = (
     "*/__init__",
     "__main__",
     "cli",
     "shipped",
+    "shown",
     "system/ends",
     "system/notices",
     "system/run_progress",

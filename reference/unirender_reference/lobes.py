@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
+from unirender.shown import short_repr
 from unirender_reference.backend import mitsuba
 from unirender_reference.integrators import path_integrator, python_integrator
 from unirender_reference.passes import (
@@ -64,6 +65,8 @@ class Lobe:
     buffer: Estimate
     weight: Float[np.ndarray, "h w 3"]
     variance: Float[np.ndarray, "h w 3"] | None
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ def pose_towards(azimuth_deg: float, elevation_deg: float, camera: Camera) -> Fl
     Args:
         azimuth_deg: about +y, from +z (0) towards +x (90).
         elevation_deg: above the horizon, within [-90, 90].
+        camera: whose framing distance it is (`Camera.distance`).
 
     Raises:
         UnirenderError: an angle is not finite, the elevation is out of its range, or the camera is none.

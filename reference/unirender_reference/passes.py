@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
+from unirender.shown import short_repr
 from unirender_reference.backend import mitsuba
 from unirender_reference.faults import ObjectFault
 from unirender_reference.integrators import path_integrator
@@ -48,6 +49,8 @@ class Estimate:
     mean: Float[np.ndarray, "h w c"]
     variance: Float[np.ndarray, "h w c"] | None
     nan_pixels: int = 0
+
+    __repr__ = short_repr
 
 
 @dataclass
@@ -287,8 +290,16 @@ def _groupable(count: int, batches: int) -> bool:
 
 
 def derive_seed(*parts: int | str) -> int:
-    """A 32-bit seed that depends on all parts, the same in every process and version of Python."""
-    return int.from_bytes(hashlib.sha256(repr(parts).encode()).digest()[:4], "little")
+    """A 32-bit seed that depends on all parts, the same in every process and version of Python.
+
+    Raises:
+        UnirenderError: a part is neither a whole number nor a text.
+    """
+    for part in parts:
+        if not isinstance(part, str | Integral):
+            raise UnirenderError(f"seed: got {part!r:.60}, expected a whole number")
+    plain = tuple(part if isinstance(part, str) else int(part) for part in parts)  # numpy's numbers print otherwise
+    return int.from_bytes(hashlib.sha256(repr(plain).encode()).digest()[:4], "little")
 
 
 def _render(

@@ -91,6 +91,9 @@ class Renderer:
         self.counters = Counters()
         self.scene = EditableScene(obj, self.camera, resolution)
 
+    def __repr__(self) -> str:
+        return f"Renderer({self.obj.name}, {self.camera}, resolution={self.resolution})"
+
     def geometry(
         self, spp: int = GEOMETRY_SPP, seed: int = 0, material: tuple[float | None, float | None] | None = None
     ) -> Intrinsics:

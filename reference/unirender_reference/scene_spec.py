@@ -11,6 +11,7 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
+from unirender.shown import short_repr
 from unirender_reference.lights import Light
 from unirender_reference.shapes import MeshObject
 
@@ -33,6 +34,12 @@ class SceneSpec:
     resolution: int = 64
     exposure_seed: int = 0
 
+    def __repr__(self) -> str:
+        return (
+            f"SceneSpec({self.obj.name}, {self.light.name}, roughness={self.roughness}, metallic={self.metallic}, "
+            f"{self.camera}, resolution={self.resolution}, exposure_seed={self.exposure_seed})"
+        )
+
     def __post_init__(self) -> None:
         kinds = {"obj": MeshObject, "light": Light, "camera": Camera, "resolution": Integral, "exposure_seed": Integral}
         for name, kind in {**kinds, "roughness": Real | None, "metallic": Real | None}.items():
@@ -49,8 +56,10 @@ class Sample:
 
     image_linear: Float[np.ndarray, "h w 3"]
     intrinsics: Intrinsics
-    variance: dict[str, Float[np.ndarray, "h w c"]]
+    variance: dict[str, Float[np.ndarray, "h w c"]] = field(repr=False)
     provenance: dict[str, str]
+
+    __repr__ = short_repr
 
 
 def scene_hash(spec: SceneSpec) -> str:

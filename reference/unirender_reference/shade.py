@@ -25,6 +25,7 @@ from unirender.arguments import as_instance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics, as_numbers
 from unirender.light.environment import as_light
+from unirender.shown import short_repr
 from unirender_reference.passes import NAN_ATTEMPTS, SAMPLES_PER_PASS, Counters, derive_seed, finite_pass, pass_count
 from unirender_reference.scene import envmap_data
 from unirender_reference.shader import PARAMETERS, Parameter, Shader, gradient, tensors
@@ -46,6 +47,8 @@ class Gradients:
     roughness: Float[np.ndarray, "h w 1"] | None = None
     metallic: Float[np.ndarray, "h w 1"] | None = None
     environment: Float[np.ndarray, "eh ew 3"] | None = None
+
+    __repr__ = short_repr
 
 
 def shade(

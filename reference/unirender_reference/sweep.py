@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
+from unirender.shown import short_repr
 from unirender_reference.noise import full_spp
 from unirender_reference.passes import TRUTH_BATCHES, Estimate, derive_seed
 from unirender_reference.render import IMAGE_DEPTH, Renderer
@@ -49,6 +50,8 @@ class Sweep:
     node_spp: tuple[int, ...]
     renders: int
     nan_pixels: int
+
+    __repr__ = short_repr
 
     def estimate(self, roughness_index: int, metallic_index: int) -> Estimate:
         """One pair; a pixel with little light and much noise can come out below 0, and stays unbiased so."""

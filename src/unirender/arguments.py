@@ -66,3 +66,14 @@ def as_coverage(value: Any, what: str) -> Float[np.ndarray, "..."]:
     """
     given = np.asarray(value)
     return given.astype(np.float32) if given.dtype.kind == "u" and given.max(initial=0) <= 1 else as_floats(value, what)
+
+
+def check_switches(**switches: Any) -> None:
+    """Looks at arguments that are on or off: of a text, any would count as on.
+
+    Raises:
+        UnirenderError: one is neither True nor False.
+    """
+    for name, value in switches.items():
+        if not isinstance(value, bool | np.bool_):
+            raise UnirenderError(f"{name}: got {value!r:.60}, expected True or False")

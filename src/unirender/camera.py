@@ -43,7 +43,7 @@ class Camera:
         object.__setattr__(self, "principal", principal)  # a list would have no hash
         if not 0.0 < self.fov_deg < 180.0:
             raise UnirenderError(
-                f"field of view: got {self.fov_deg} degrees, expected a vertical angle between 0 and 180; pass --fov"
+                f"field of view: got {self.fov_deg} degrees, expected a vertical angle between 0 and 180"
             )
         if len(self.principal) != 2 or not all(math.isfinite(p) for p in self.principal):
             raise UnirenderError(f"principal point: got {self.principal}, expected two finite fractions of the frame")
@@ -89,7 +89,7 @@ class Camera:
         """
         found = _DESCRIPTION.fullmatch(text.strip()) if isinstance(text, str) else None
         if found is None:
-            raise UnirenderError(f"camera: got {text!r}, expected a text like {cls().describe()!r}; pass --fov")
+            raise UnirenderError(f"camera: got {text!r}, expected a text like {cls().describe()!r}")
         fov_deg, x, y = (float(number) for number in found.groups())
         return cls(fov_deg, (x, y))
 

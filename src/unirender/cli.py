@@ -147,11 +147,6 @@ def read_light(path: Path) -> "np.ndarray":
     from unirender_reference.lights import load_light
 
     light = load_light(path, normalise=False)
-    if str(light.provenance["rule"]).startswith("photograph"):
-        notice(
-            f"light {path}: taken as a photograph of what lies behind the camera, not as a panorama, which is a "
-            "lat-long HDR, EXR or PFM file"
-        )
     if share := light.provenance.get("negative_share"):
         notice(f"light {path}: {100 * float(share):.1g}% of its radiance is negative and was set to 0")
     return light.environment

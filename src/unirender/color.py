@@ -62,7 +62,12 @@ def display_slope(
     Args:
         linear: any range.
         space: "srgb": the display value is `image_srgb`; "linear": only the clip to [0, 1].
+
+    Raises:
+        UnirenderError: another space.
     """
+    if space not in ("srgb", "linear"):
+        raise UnirenderError(f"space: got {space!r:.60}, expected 'srgb' or 'linear'")
     x = np.asarray(linear, np.float64)
     if space == "srgb":
         slope = np.where(x <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(x, 0.0031308) ** (1 / 2.4 - 1))

@@ -77,7 +77,7 @@ def new_folder(path: str | Path, *, overwrite: bool | None = None, tidy: bool = 
         raise UnirenderError(f"{shown}: is a file, expected a folder to write to")
     if path.is_dir() and any(path.iterdir()):
         if not overwrite:
-            option = "" if overwrite is None else " or pass --overwrite"
+            option = "" if overwrite is None else ", or overwrite it (--overwrite)"
             raise UnirenderError(f"{shown}: exists and is not empty; choose another folder{option}")
         if (path / SUMMARY_FILE).is_file():
             raise UnirenderError(
@@ -138,7 +138,7 @@ def folder_beside(path: str | Path, output: str | Path, temporary: Path, *, over
 
 
 def write_result(
-    folder: Path,
+    folder: str | Path,
     intrinsics: Intrinsics | None,
     meta: Mapping[str, Any],
     image_linear: Float[np.ndarray, "h w 3"] | None = None,
@@ -154,9 +154,13 @@ def write_result(
             added.
         image_linear: a rendered image, premultiplied; written as `image.exr` and `image.png` (with alpha if the mask is
             known).
+
+    Raises:
+        UnirenderError: the maps are no `Intrinsics`, or the folder is no path.
     """
     if intrinsics is not None:
         as_instance(intrinsics, Intrinsics, "result")
+    folder = as_path(folder, "folder")
     attributes = header_attributes(meta, None if intrinsics is None else intrinsics.camera)
     if intrinsics is not None:
         if any(name in IMAGE_MAPS for name in intrinsics.present):
@@ -229,10 +233,12 @@ def read_result(path: str | Path, fov_deg: float | None = None, *, light: bool =
     try:
         if camera is None and CAMERA_ATTRIBUTE in attributes:
             text = attributes[CAMERA_ATTRIBUTE]
-            camera = Camera.parse(text) if fov_deg is None else header_camera(attributes)
+            camera = _camera_of_header(text) if fov_deg is None else header_camera(attributes)
         if camera is None and fov_deg is None:
             logger.warning(
-                "%s says nothing of its camera: a field of view of %g degrees is assumed (--fov)", path, DEFAULT_FOV_DEG
+                "%s says nothing of its camera: a field of view of %g degrees is assumed (fov_deg, --fov)",
+                path,
+                DEFAULT_FOV_DEG,
             )
         camera = camera or Camera()
         if fov_deg is not None:
@@ -245,11 +251,24 @@ def read_result(path: str | Path, fov_deg: float | None = None, *, light: bool =
         raise UnirenderError(
             f"{path}: {ENVIRONMENT_FILE} is another light than that of the specular and diffuse beside it, which are "
             "rendered as they are; put it back, and pass the other light as --environment (with --exposure 0 as bright "
-            "as it is): they are then derived from it"
+            "as it is), in Python read_result(path, light=False).replace(environment=other, specular=None, "
+            "diffuse=None): they are then derived from it"
         )
     if not intrinsics.present:
         raise UnirenderError(f"{path}: has the channels {', '.join(sorted(channels))}, expected maps like albedo.R")
     return intrinsics
+
+
+def _camera_of_header(text: str) -> Camera:
+    """The camera that a header states.
+
+    Raises:
+        UnirenderError: it is none.
+    """
+    try:
+        return Camera.parse(text)
+    except UnirenderError as error:
+        raise UnirenderError(f"{error}; pass the field of view (fov_deg, --fov)") from error
 
 
 def _is_lit(intrinsics: Intrinsics) -> bool:
@@ -271,7 +290,8 @@ def _read_environment(file: Path) -> Float[np.ndarray, "eh ew 3"]:
     if not on_pole_grid(attributes):
         raise UnirenderError(
             f"{file}: is no environment that unirender wrote, and a lat-long map from elsewhere has to be resampled; "
-            "take it out of the folder and pass it as --environment (with --exposure 0 as bright as it is)"
+            "take it out of the folder and pass it as --environment (with --exposure 0 as bright as it is), in Python "
+            "load_light(path, normalise=False).environment of unirender_reference.lights"
         )
     try:
         return channels_rgb(channels)

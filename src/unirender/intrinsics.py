@@ -16,6 +16,7 @@ from jaxtyping import Float
 from unirender.blocks import by_rows
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
+from unirender.shown import in_short
 from unirender.vectors import lengths
 
 MAPS: dict[str, int] = {
@@ -100,9 +101,7 @@ class Intrinsics:
             _check_range(name, value)
 
     def __repr__(self) -> str:
-        maps = [
-            f"{name} {list(value.shape)} in [{value.min():.3g}, {value.max():.3g}]" for name, value in self.maps.items()
-        ]
+        maps = [f"{name} {in_short(value)}" for name, value in self.maps.items()]
         return f"Intrinsics({', '.join([*maps, repr(self.camera)])})"
 
     @property
@@ -173,7 +172,11 @@ def as_numbers(name: str, value: Any) -> Float[np.ndarray, "..."]:
             raise UnirenderError(
                 f"{name}: got a tensor that is no array ({error}), expected value.detach().float().cpu().numpy()"
             ) from error
-        raise UnirenderError(f"{name}: got {type(value).__name__} {value!r:.60}, expected numbers") from error
+        kind = type(value).__name__
+        if isinstance(getattr(value, name, None), np.ndarray):
+            raise UnirenderError(f"{name}: got {kind}, expected numbers; it has some as its `{name}`") from error
+        got = f"of {value.dtype} values" if isinstance(value, np.ndarray) else f"{value!r:.60}"
+        raise UnirenderError(f"{name}: got {kind} {got}, expected numbers") from error
 
 
 def as_radiance(name: str, value: Any) -> Float[np.ndarray, "..."]:

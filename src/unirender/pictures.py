@@ -16,6 +16,7 @@ from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, header_camera, read_exr
 from unirender.picture_files import display_files
 from unirender.picture_files.display_files import FORMATS, picture_count, srgb_values_and_remarks, stored_values
+from unirender.shown import short_repr
 
 DISPLAY_WHITE = 254.5 / 255  # a display value from which a channel is clipped
 OPAQUE = DISPLAY_WHITE  # a coverage from which it is whole: no alpha of 8 bits lies between
@@ -45,6 +46,8 @@ class Picture:
     negative: float = 0.0
     camera: Camera | None = None
     remarks: Mapping[str, str] = field(default_factory=dict)
+
+    __repr__ = short_repr
 
     @property
     def clipped(self) -> float:

@@ -40,6 +40,10 @@ def write_png(path: str | Path, values: Float[np.ndarray, "h w c"]) -> None:
     values = as_floats(values, "picture")
     if values.ndim != 3 or values.shape[-1] not in (1, 3, 4):
         raise UnirenderError(f"picture: got shape {values.shape}, expected (height, width, 1, 3 or 4)")
+    if not np.isfinite(values).all():
+        raise UnirenderError(
+            "picture: got NaN or infinite values, expected display values in [0, 1]; repair them first"
+        )
     _save_png(as_path(path), by_rows(eight_bits, values))
 
 

@@ -127,7 +127,7 @@ def test_a_failure_inside_leaves_the_old_folder_and_nothing_else(tmp_path: Path)
     assert full.value.filename == str(out)
     assert (out / "a").read_text() == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    with pytest.raises(UnirenderError, match="or pass --overwrite"), new_folder(out, overwrite=False):
+    with pytest.raises(UnirenderError, match="or overwrite it"), new_folder(out, overwrite=False):
         pass
     (out / "meta.json").unlink()
     with pytest.raises(UnirenderError, match=r"no meta\.json"), new_folder(out, overwrite=True):
@@ -395,7 +395,7 @@ def test_an_environment_from_elsewhere_is_not_taken_for_one_of_ours(tmp_path: Pa
     """Its rows are areas, ours lie on the poles: taken as it is, light from above would be weighed wrongly."""
     mask = np.ones((8, 8, 1), dtype=np.float32)
     light = np.ones((8, 16, 3), dtype=np.float32)
-    write_result(tmp_path, Intrinsics(mask=mask, roughness=mask, environment=light, camera=Camera()), {})
+    write_result(str(tmp_path), Intrinsics(mask=mask, roughness=mask, environment=light, camera=Camera()), {})
     assert read_result(tmp_path).environment is not None
     write_exr(tmp_path / "environment.exr", image_channels(light))
     with pytest.raises(UnirenderError, match=r"environment\.exr: is no environment that .*--environment"):

@@ -502,6 +502,24 @@ def test_diffusers_conventions(pipeline: UniRenderPipeline, tmp_path: Path) -> N
     assert all(torch.equal(p, q) for p, q in zip(part.parameters(), pipeline.dual_stream.parameters(), strict=True))
 
 
+def test_a_pipeline_of_anothers_components_is_the_same() -> None:
+    pipeline = make_pipeline()
+    pipeline.register_to_config(material="map", calibration={"roughness": [0.5, 0.3]})
+    image, mask = picture()
+    expected = get(pipeline.decompose(image, mask).intrinsics, "roughness")
+    for again in (UniRenderPipeline(**pipeline.components), UniRenderPipeline.from_pipe(pipeline)):
+        again.set_progress_bar_config(disable=True)
+        np.testing.assert_array_equal(get(again.decompose(image, mask).intrinsics, "roughness"), expected)
+
+
+def test_a_network_that_is_exchanged_is_asked_as_in_its_own_pipeline() -> None:
+    pipeline, other = make_pipeline(), make_pipeline(1, resolution=2 * SIZE, physics_prior="none", derived_light=True)
+    pipeline.dual_stream = other.dual_stream
+    image, mask = picture(2 * SIZE, 2 * SIZE)
+    first, second = (p.edit(image, mask, roughness=0.8) for p in (pipeline, other))
+    np.testing.assert_array_equal(first.image_linear, second.image_linear)
+
+
 def test_offloaded_weights_give_the_same(pipeline: UniRenderPipeline, monkeypatch: pytest.MonkeyPatch) -> None:
     # accelerate makes an output anew, from a dict
     monkeypatch.setattr(DualStreamOutput, "__init__", inspect.unwrap(DualStreamOutput.__init__))

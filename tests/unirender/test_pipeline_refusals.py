@@ -285,6 +285,27 @@ def test_a_network_that_answers_nan_is_refused_in_both_directions() -> None:
         pipeline.render(maps)
 
 
+def test_a_frame_without_a_mask_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    pipeline, (image, mask) = make_pipeline(), picture()
+    pipeline.decompose(image, mask)
+    pipeline.decompose(image, np.ones_like(mask))  # asked for
+    assert "mask" not in caplog.text
+    pipeline.edit(image, metallic=1.0)
+    pipeline.decompose(image)
+    assert caplog.text.count("mask: not given, nor an alpha channel: the whole frame is taken") == 1
+
+
+def test_normals_of_other_axes_are_told(pipeline: UniRenderPipeline, caplog: pytest.LogCaptureFixture) -> None:
+    image, mask = picture()
+    maps = pipeline.decompose(image, mask).intrinsics
+    normal = np.zeros_like(maps.require("normal")["normal"])
+    for z in (1, -1):
+        caplog.clear()
+        normal[..., 2] = z
+        pipeline.render(maps.replace(normal=normal))
+        assert ("100% of the object's normals face away from the camera" in caplog.text) == (z < 0)
+
+
 def test_an_edit_says_where_the_predicted_light_is_too_coarse(pipeline: UniRenderPipeline) -> None:
     """A light of 16 x 32 has no reflection as sharp as roughness 0.1; without a new roughness there is no question."""
     image, mask = picture()

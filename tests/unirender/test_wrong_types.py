@@ -15,29 +15,30 @@ import numpy as np
 import torch
 from diffusers.utils import logging
 from unirender.camera import Camera
-from unirender.color import image_srgb, srgb_decode, unpremultiply
+from unirender.color import display_slope, image_srgb, srgb_decode, unpremultiply
 from unirender.composite import composite_image
 from unirender.light.exposure import exposure_factor
 from unirender.exr import read_exr, write_exr
 from unirender.files import map_picture, read_result, write_png, write_result
 from unirender.intrinsics import Intrinsics
-from unirender.pictures import read_picture
+from unirender.pictures import Picture, read_picture
 from PIL import Image
 from unirender.light.environment import has_bright_pole, resample_environment, rotate_environment, sample_environment
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.scene_export import export_scene
 from unirender.light.surface_light import diffuse_light, specular_light
-from unirender_evaluation import read_results, score
+from unirender_evaluation import Variant, read_results, score
 from unirender_evaluation.scoring import score_maps
 from unirender_evaluation.suites.suite import load_suite
 from unirender_reference.denoise import denoise
 from unirender_reference.effects import render_effects
-from unirender_reference.lights import Light, load_light, make_light
+from unirender_reference.lights import Light, light_pool, load_light, make_light
 from unirender_reference.lights.light import area_resampled
 from unirender_reference.meshes import load_mesh
 from unirender_reference.multiview import orbit, pose_towards
 from unirender_reference.optimize.files.folder import read_views
 from unirender_reference.optimize.views import View
+from unirender_reference.passes import derive_seed
 from unirender_reference.render import Renderer, SceneSpec, render_sample
 from unirender_reference.shade import shade, shade_gradients
 from unirender_reference.shapes import make_object
@@ -49,6 +50,7 @@ mask[4:-4, 4:-4] = 1
 image = np.full((16, 24, 3), 0.5, np.float32)
 decomposition = pipeline.decompose(image, mask)
 light = np.ones((16, 32, 3), np.float32)
+sky = Light('a', light)
 renderer = Renderer(make_object(1, 'train'), resolution=8)
 maps, bytes_8 = decomposition.intrinsics, (200 * light).astype(np.uint8)
 photograph = Image.fromarray(bytes_8)
@@ -82,6 +84,22 @@ CASES = {
     "pipeline.edit(image, mask, roughness=[0.2, 0.3])": "roughness: got shape (2,), expected one number",
     "pipeline.edit(image, mask, metallic=np.zeros(0))": "metallic: got shape (0,), expected one number",
     "pipeline.edit(image, mask, metallic='gold')": "metallic: got str 'gold', expected numbers",
+    "pipeline.edit(image, mask, roughness=True)": "roughness: got True, expected one number in [0, 1], or a map",
+    "pipeline.edit(image, mask, metallic=np.bool_(1))": "metallic: got True, expected one number in [0, 1], or a map",
+    "pipeline.decompose(image.astype(np.uint16), mask)": "image: got uint16 values, expected floats in [0, 1]; divide",
+    "pipeline.overflow(decomposition)": "render: got Decomposition, expected unirender.intrinsics.Intrinsics; it",
+    "shade(maps, sky)": "environment: got Light, expected numbers; it has some as its `environment`",
+    "Intrinsics(albedo=np.full((2, 2, 3), '0.5'))": "albedo: got ndarray of <U3 values, expected numbers",
+    "pipeline.decompose(Picture(image, mask, 'a.png'))": "image: got a Picture, expected its image_srgb, and its mask",
+    "write_result(3, maps, {})": "folder: got int 3, expected a path",
+    "export_scene('not_made', maps, overwrite='no')": "overwrite: got 'no', expected True or False",
+    "light_pool('docs/_static', 'train', turn='no')": "turn: got 'no', expected True or False",
+    "display_slope(image, 'sRGB')": "space: got 'sRGB', expected 'srgb' or 'linear'",
+    "write_png('not_made.png', np.nan * image)": "picture: got NaN or infinite values, expected display values",
+    "load_light('docs/_static/example.png', photograph='no')": "photograph: got 'no', expected True or False",
+    "load_light('docs/_static/example.png', normalise=None)": "normalise: got None, expected True or False",
+    "score(maps, maps, Variant(space='sRGB'))": "variant: got space 'sRGB', expected one of srgb, linear",
+    "score(decomposition, decomposition)": "score: got Decomposition, expected unirender.intrinsics.Intrinsics; it has",
     "pipeline.edit(image, mask, metallic='0.2')": "metallic: got str '0.2', expected numbers",
     "pipeline.render(decomposition)": "render: got Decomposition, expected unirender.intrinsics.Intrinsics; it has one",
     "export_scene(maps, 'scene')": "folder: got Intrinsics Intrinsics(albedo",
@@ -137,6 +155,8 @@ CASES = {
     "renderer.image(light, 0.5, 0.5, 16, pose=np.eye(4)[:3])": "pose: the pose is no rotation and position; expected",
     "renderer.image(light, 0.5, 0.5, 16, pose=np.insert(np.eye(4)[:3], 3, [0, 0, 4, 1], 0))": "pose: the pose is no",
     "renderer.image(light, 0.5, 0.5, 16, pose='front')": "pose: got str 'front', expected numbers",
+    "renderer.image(light, 0.5, 0.5, 16, seed=1.0)": "seed: got 1.0, expected a whole number",
+    "shade(maps, light, seed=None)": "seed: got None, expected a whole number",
     "Renderer(renderer.obj, resolution=8.5)": "resolution: got 8.5, expected a whole number of pixels",
     "make_light('a', 'train')": "make_light: got seed 'a', split 'train'; expected seed >= 0",
     "Light('a', light.tolist())": "light: got name 'a' and an environment of type list, expected a text and a",
@@ -176,6 +196,7 @@ CASES = {
     "UniRenderPipeline.from_pretrained(123)": "checkpoint: got 123, expected the path of a pipeline folder",
     "pipeline.render(maps, derived='shadow')": "derived: got shadow, expected names out of",
     "pipeline.edit(image, mask, metallic=1.0, decomposition=maps)": "decomposition: got Intrinsics, expected the",
+    "Camera(200)": "field of view: got 200 degrees, expected a vertical angle between 0 and 180",
     "Camera('36')": "camera: got Camera(fov_deg='36'",
     "Camera(36, None)": "camera: got Camera(fov_deg=36, principal=None)",
     "Camera(36, 'ab')": "camera: got Camera(fov_deg=36, principal='ab')",
@@ -185,13 +206,16 @@ FINE = (
     "pipeline.render(maps.replace(environment=0 * light))",
     "shade_gradients(maps, np.zeros((16, 24, 3)).tolist(), light, spp=1, wrt='albedo').albedo",
     "rotate_environment(light.astype(np.float64), np.eye(3))",
-    "hash(Camera(36, [0.5, 0.4])) == hash(Camera(36, (0.5, 0.4)))",
+    "hash(Camera(36, [0.5, 0.4])) == hash(Camera(36, (0.5, 0.4))) or None",
+    "derive_seed(np.int64(1), 'image') == derive_seed(1, 'image') or None",
     "pipeline.edit(image, mask, metallic=np.full((16, 24), 0.2), decomposition=decomposition)",
     "pipeline.edit(image, mask, metallic=np.array([0.2]), decomposition=decomposition)",
     "pipeline.decompose_batch(np.stack([image, image]), np.stack([mask, mask]))",
     "pipeline.decompose_batch(iter([image, image]), iter([mask, mask]))",
     "unpremultiply(np.stack([image, image]), mask)",
     "unpremultiply(image, (mask > 0.5).astype(np.uint8))",
+    "pipeline.edit(image, mask, metallic=mask > 0.5, decomposition=decomposition)",
+    "score(image, image, 'masked', mask=mask > 0.5)",
 )
 
 

@@ -33,6 +33,13 @@ class Results:
     source: str
     lights: Lights = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        run = self.run
+        return (
+            f"Results({self.label}: suite {run.suite} at {run.resolution} px, {run.date or 'no date'}, "
+            f"{len(run.methods)} methods, {len(self.records)} records)"
+        )
+
     @property
     def label(self) -> str:
         """A short name: the file's, or its folder's where the file has the usual name."""

@@ -108,6 +108,9 @@ class Suite:
     def _ceiling(self, name: str) -> Float[np.ndarray, "h w 3"] | None:
         return self._mean(CEILING + name) if CEILING + name in self._members else None
 
+    def __repr__(self) -> str:
+        return f"Suite({self.spec.name}, {len(self.scenes)} scenes at {self.spec.resolution} px)"
+
     @cached_property
     def scenes(self) -> tuple[Scene, ...]:
         """All scenes, objects outermost: the order in which a run scores them."""

@@ -17,6 +17,7 @@ taken as it is. Pixels of a Radiance file are divided by what its header says th
 `COLORCORR`), and their colours brought to Rec.709 where it states other `PRIMARIES`.
 """
 
+import logging
 import math
 import re
 from pathlib import Path
@@ -25,7 +26,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from unirender.arguments import as_path
+from unirender.arguments import as_path, check_switches
 from unirender.blocks import by_rows
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
@@ -57,6 +58,8 @@ BYTES_A_TEXEL, BYTES_OF_NONE = 50, 5e8  # of memory: what it takes to read a map
 HDR_SUFFIXES = {".hdr", ".rgbe", ".pic", ".exr", ".pfm"}
 PHOTOGRAPH_SHAPE = (128, 256)
 
+_log = logging.getLogger("unirender.lights")
+
 
 def load_light(
     path: str | Path,
@@ -69,7 +72,7 @@ def load_light(
     Args:
         path: a lat-long HDR/EXR/PFM map, or an LDR picture.
         photograph: True: an ordinary picture, put on the sphere by the module's rule; False: a lat-long map;
-            None: by suffix (HDR formats are lat-long, others are photographs).
+            None: by suffix (HDR formats are lat-long, others are photographs, and this is logged).
         shape: rows and columns of the result; None: the file's own for lat-long maps (bit for bit where it is on the
             contract's grid; other maps of fewer than 64 rows 64 x 128: on fewer rows lamps would smear), 128 x 256 for
             photographs.
@@ -85,6 +88,9 @@ def load_light(
             is, or no lat-long map; or the shape is none of a map.
     """
     path = as_path(path, "light")
+    check_switches(normalise=normalise)
+    if photograph is not None:
+        check_switches(photograph=photograph)
     if not path.is_file():
         missing = "is a folder" if path.is_dir() else "no such file"
         raise UnirenderError(
@@ -98,6 +104,12 @@ def load_light(
     pixels, attributes = _read_hdr(path) if hdr else (expand_range(srgb_decode(_read_ldr(path))), {})
     check_finite(pixels, f"light {path}")
     as_photograph = photograph if photograph is not None else not hdr
+    if as_photograph and photograph is None:
+        _log.warning(
+            "light %s: taken as a photograph of what lies behind the camera, not as a panorama, which is a lat-long "
+            "HDR, EXR or PFM file (in Python also any other, with photograph=False)",
+            path,
+        )
     provenance = {"source": "file", "file": path.name, "rule": "lat-long"}
     if as_photograph:
         provenance["rule"] = f"photograph: knee {KNEE:g}, peak {PEAK:g}, window {WINDOW_DEG:g} deg, floor {FLOOR:g}"

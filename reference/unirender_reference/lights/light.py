@@ -16,6 +16,7 @@ from unirender.color import luminance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import check_radiance
 from unirender.light.environment import check_shape, hat_weights, mean_radiance, weighted_means
+from unirender.shown import short_repr
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -37,6 +38,8 @@ class Light:
     name: str
     environment: Float[np.ndarray, "h w 3"]
     provenance: Mapping[str, str] = field(default_factory=dict)
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         e = self.environment

@@ -19,6 +19,7 @@ from typing import Literal
 
 import numpy as np
 
+from unirender.arguments import check_switches
 from unirender.errors import UnirenderError
 from unirender_reference.lights.files import HDR_SUFFIXES, load_light
 from unirender_reference.lights.light import SHAPE, Light
@@ -62,7 +63,8 @@ class LightPool:
         Raises:
             UnirenderError: as `load_light`.
         """
-        light = load_light(self.folder / name, shape=(self.height, 2 * self.height))
+        photograph = Path(name).suffix.lower() not in HDR_SUFFIXES
+        light = load_light(self.folder / name, photograph, (self.height, 2 * self.height))
         return Light(re.sub(r"[^\w-]", "-", name), light.environment, {**light.provenance, "file": name})
 
     def draw(self, rng: np.random.Generator) -> Light:
@@ -121,6 +123,7 @@ def light_pool(
     Raises:
         UnirenderError: no such folder, no places for this side of the division, or a number outside its range.
     """
+    check_switches(turn=turn)
     if split not in ("train", "test"):
         raise UnirenderError(f"light_pool: got split {split!r}, expected 'train' or 'test'")
     if not 0 < share <= 1:

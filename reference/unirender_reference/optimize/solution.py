@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
+from unirender.shown import short_repr
 from unirender_reference.scene import envmap_data
 from unirender_reference.shapes import MeshObject
 
@@ -21,6 +22,8 @@ class Solution:
 
     obj: MeshObject
     environment: Float[np.ndarray, "eh ew 3"]
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         missing = [name for name in ("roughness", "metallic") if getattr(self.obj, name) is None]

@@ -10,6 +10,7 @@ from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.intrinsics import as_numbers
 from unirender.pictures import DISPLAY_WHITE
+from unirender.shown import short_repr
 from unirender_reference.scene import check_pose
 
 RANGE_TOLERANCE = 1e-3
@@ -38,6 +39,8 @@ class View:
     pose: Float[np.ndarray, "4 4"]
     name: str = "view"
     clipped: Bool[np.ndarray, "h w 3"] | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         if not isinstance(self.camera, Camera):

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from unirender.errors import UnirenderError
+from unirender.shown import short_repr
 
 UNIT_TOLERANCE = 1e-3
 CONVERT = "repair what is not finite, and convert it by .astype(np.float32)"
@@ -51,7 +52,9 @@ class MeshObject:
     roughness: Float[np.ndarray, "hr wr"] | None = None
     metallic: Float[np.ndarray, "hm wm"] | None = None
     normal_map: Float[np.ndarray, "hn wn 3"] | None = None
-    provenance: Mapping[str, str] = field(default_factory=dict)
+    provenance: Mapping[str, str] = field(default_factory=dict, repr=False)
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         self._check_types()

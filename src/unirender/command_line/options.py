@@ -73,11 +73,8 @@ class ModelOptions:
             raise UsageError(f"--sampler {self.sampler}: one step needs none, expected more --steps (or --samples)")
         if not -(2**63) <= self.seed < 2**64:
             raise UsageError(f"--seed {self.seed}: expected an integer of 64 bits")
-        if self.fov is not None:
-            from unirender.camera import Camera
-
-            with usage():
-                Camera(fov_deg=self.fov)
+        if self.fov is not None and not 0 < self.fov < 180:
+            raise UsageError(f"--fov {self.fov:g}: expected degrees between 0 and 180")
 
     def load(self) -> "UniRenderPipeline":
         """The pipeline on its device.

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
 MAX_STOPS = 32
-MANY_AWAY = 0.2  # share of the object's normals, from which a notice is due
 MANY_TILES = 500  # from which a notice is due
 IMAGINED = ("albedo", "specular", "diffuse", "environment")  # by the network, where they are not given
 
@@ -124,7 +123,7 @@ def missing_maps(intrinsics: "Intrinsics", new_light: bool) -> dict[str, Any]:
 
 
 def normals_away(intrinsics: "Intrinsics") -> dict[str, Any]:
-    """For `meta.json`: the share of the covered normals that face away from the camera; a notice where there are many.
+    """For `meta.json`: the share of the covered normals that face away from the camera; the pipeline tells of many.
 
     Args:
         intrinsics: with a mask.
@@ -133,13 +132,7 @@ def normals_away(intrinsics: "Intrinsics") -> dict[str, Any]:
 
     if intrinsics.normal is None:  # what needs it says so
         return {}
-    share = facing_away(intrinsics)
-    if share > MANY_AWAY:
-        notice(
-            f"{share:.0%} of the object's normals face away from the camera: expected camera axes, +z towards the "
-            "viewer; maps of other axes have to be turned"
-        )
-    return {"facing_away": share}
+    return {"facing_away": facing_away(intrinsics)}
 
 
 def at_white(image_linear: "np.ndarray", mask: "np.ndarray | None") -> dict[str, Any]:

@@ -73,11 +73,9 @@ class DualStreamPipeline(DiffusionPipeline):
         self.register_to_config(material=material, calibration=check_lines(calibration))
         self.dual_stream: DualStreamModel
         self.scheduler: SchedulerMixin
-        codec = make_codec(dual_stream.config["codec"], dual_stream.config["patch"], vae)
-        self.conditioning = Conditioning.of(dict(dual_stream.config), codec)
+        self.vae: AutoencoderKL | None
         self.conditioning.check_channels(dict(dual_stream.config))
-        self.size = dual_stream.config["sample_size"] * codec.factor
-        self._reported: set[str] = set()  # maps whose overflow was logged
+        self._reported: set[str] = set()  # of what something was logged
 
     @classmethod
     def from_pretrained(  # pyright: ignore[reportIncompatibleMethodOverride] - a path may be left out here
@@ -107,6 +105,23 @@ class DualStreamPipeline(DiffusionPipeline):
         # Faster on a CPU, most so in batches.
         pipeline.dual_stream.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] - diffusers' own
         return pipeline
+
+    @property
+    def components(self) -> dict[str, Any]:
+        """What the class takes to make this pipeline again: its parts and its settings, which decide answers, too."""
+        return super().components | {name: self.config[name] for name in ("material", "calibration")}
+
+    # Of the network that is there: users of diffusers exchange parts of a pipeline.
+    @property
+    def conditioning(self) -> Conditioning:
+        """How maps enter the network."""
+        config = dict(self.dual_stream.config)
+        return Conditioning.of(config, make_codec(config["codec"], config["patch"], self.vae))
+
+    @property
+    def size(self) -> int:
+        """Side of the network's own square, pixels."""
+        return self.dual_stream.config["sample_size"] * self.conditioning.codec.factor
 
     @property
     def size_multiple(self) -> int:
@@ -149,6 +164,9 @@ class DualStreamPipeline(DiffusionPipeline):
 
     def _report_overflow(self, overflow: dict[str, Overflow]) -> None:
         for name, over in overflow.items():
-            if name not in self._reported:
-                self._reported.add(name)
-                logger.warning("%s: %s; they are kept, but what it makes of them is a guess", name, over)
+            self._report_once(name, f"{over}; they are kept, but what it makes of them is a guess")
+
+    def _report_once(self, name: str, remark: str) -> None:
+        if name not in self._reported:
+            self._reported.add(name)
+            logger.warning("%s: %s", name, remark)

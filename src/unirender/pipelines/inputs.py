@@ -14,7 +14,7 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import RANGE_TOLERANCE, Intrinsics, as_numbers
 from unirender.light.environment import as_light, is_twice_as_wide
 from unirender.picture_files.display_files import display_colors, display_values, is_turned
-from unirender.pictures import coverage
+from unirender.pictures import Picture, coverage
 from unirender.pipelines.bounced_light import WHITE_SKY, bounced_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.framing import thumbnail
@@ -29,6 +29,7 @@ DERIVABLE = ("specular", "diffuse")  # from a light
 MIN_SIDE = 8  # pixels
 MASK_TOLERANCE = 1 / 255  # between masks that are the same but for the 8 bits of a file
 PICTURE_TOLERANCE = 2 / 255  # between display values times such masks that are the same but for these 8 bits
+MANY_AWAY = 0.2  # share of the object's normals, from which it is told
 RANGE_ADVICE = "divide 8 bits by 255 and 16 bits by 65535; tone-map or clip radiance"
 
 logger = logging.getLogger(__name__)
@@ -70,6 +71,8 @@ def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"]
         picture, alpha = values[..., :3], values[..., 3:] if values.shape[-1] == 4 else None
     elif isinstance(image, np.ndarray):
         picture, alpha = image, None
+    elif isinstance(image, Picture):
+        raise UnirenderError("image: got a Picture, expected its image_srgb, and its mask as the mask")
     else:
         raise UnirenderError(
             f"image: got {type(image).__name__}, expected a numpy array [h w 3] or a PIL picture; a file is read by "
@@ -79,8 +82,11 @@ def as_picture(image: Any, mask: Any = None) -> tuple[Float[np.ndarray, "h w 3"]
         raise UnirenderError(
             f"image: got shape {picture.shape}, expected [height, width, 3]; {_shape_advice(picture.shape)}"
         )
-    if picture.dtype == np.uint8:
-        raise UnirenderError("image: got uint8 values, expected floats in [0, 1]; divide by 255, or pass a PIL picture")
+    if picture.dtype.kind == "u":
+        raise UnirenderError(
+            f"image: got {picture.dtype} values, expected floats in [0, 1]; divide by {np.iinfo(picture.dtype).max}, "
+            "or pass a PIL picture"
+        )
     if min(picture.shape[:2]) < MIN_SIDE:
         raise UnirenderError(f"image: got {picture.shape[:2]} pixels, expected at least {MIN_SIDE} along each side")
     picture = _checked("image", picture, RANGE_ADVICE)
@@ -272,6 +278,17 @@ def with_mask(intrinsics: Intrinsics) -> Intrinsics:
     return intrinsics.replace(mask=surface.astype(np.float32))
 
 
+def report_facing_away(intrinsics: Intrinsics) -> None:
+    """Logs that many of the normals face away from the camera: mostly they have other axes."""
+    share = facing_away(with_mask(intrinsics))
+    if share > MANY_AWAY:
+        logger.warning(
+            "%.0f%% of the object's normals face away from the camera: expected camera axes, +z towards the viewer; "
+            "maps of other axes have to be turned",
+            100 * share,
+        )
+
+
 def facing_away(intrinsics: Intrinsics) -> float:
     """Share of the coverage whose normals face away from the camera; normal and mask have to be known."""
     maps = intrinsics.require("normal", "mask")
@@ -290,6 +307,8 @@ def as_material(name: str, value: Any, mask: Float[np.ndarray, "h w 1"]) -> Floa
     Raises:
         UnirenderError: it is no number, outside [0, 1], or of another size.
     """
+    if isinstance(value, bool | np.bool_):
+        raise UnirenderError(f"{name}: got {value}, expected one number in [0, 1], or a map")
     given = as_numbers(name, value)
     if given.size != 1 and given.shape not in (mask.shape, mask.shape[:2]):
         raise UnirenderError(

@@ -1,7 +1,7 @@
 """What the pipeline returns, and how predictions become `Intrinsics`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.masked_maps import constant_map, masked_mean, unit_normal
 from unirender.pipelines.revealed_light import agreeing_light
+from unirender.shown import in_short
 
 PREDICTED = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment")
 
@@ -41,12 +42,19 @@ class Decomposition:
     intrinsics: Intrinsics
     roughness: float
     metallic: float
-    std: dict[str, np.ndarray] | None = field(default=None, repr=False)
+    std: dict[str, np.ndarray] | None = None
     samples: tuple[Intrinsics, ...] = ()
-    network_light: Float[np.ndarray, "eh ew 3"] | None = field(default=None, repr=False)
-    agreeing_light: Float[np.ndarray, "eh ew 3"] | None = field(default=None, repr=False)
-    thumbnail: Float[np.ndarray, "th tw 3"] | None = field(default=None, repr=False)
+    network_light: Float[np.ndarray, "eh ew 3"] | None = None
+    agreeing_light: Float[np.ndarray, "eh ew 3"] | None = None
+    thumbnail: Float[np.ndarray, "th tw 3"] | None = None
     made_with: Mapping[str, Any] | None = None
+
+    def __repr__(self) -> str:
+        samples = f"{len(self.samples)} samples, " if self.samples else ""
+        return (
+            f"Decomposition(roughness={self.roughness:.3g}, metallic={self.metallic:.3g}, {samples}{self.intrinsics}, "
+            f"made_with={self.made_with})"
+        )
 
     @property
     def with_network_light(self) -> Intrinsics:
@@ -73,11 +81,17 @@ class EditResult:
             (`unirender.pipelines.editing.too_coarse`); None where the roughness was not edited.
     """
 
-    image_linear: Float[np.ndarray, "h w 3"] = field(repr=False)
+    image_linear: Float[np.ndarray, "h w 3"]
     intrinsics: Intrinsics
     decomposition: Decomposition
     bounded: float = 0.0
-    coarse: Bool[np.ndarray, "h w 1"] | None = field(default=None, repr=False)
+    coarse: Bool[np.ndarray, "h w 1"] | None = None
+
+    def __repr__(self) -> str:
+        return (
+            f"EditResult(image_linear {in_short(self.image_linear)}, bounded={self.bounded:.3g}, "
+            f"coarse_share={self.coarse_share:.3g}, {self.intrinsics})"
+        )
 
     @property
     def coarse_share(self) -> float:

@@ -4,10 +4,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float
 
+from unirender.arguments import check_switches
 from unirender.camera import Camera
 from unirender.diffusion.sampling import NUM_SAMPLES, Generators, StepEnd, is_whole, steps_of
 from unirender.errors import UnirenderError
@@ -155,17 +155,6 @@ def check_settings(sampling: Mapping[str, Any], **switches: Any) -> None:
     if unknown := sorted(set(sampling) - set(SETTINGS)):
         raise TypeError(f"got an unexpected keyword argument {unknown[0]!r}, expected some of {', '.join(SETTINGS)}")
     check_switches(**switches)
-
-
-def check_switches(**switches: Any) -> None:
-    """Looks at arguments that are on or off: of a text, any would count as on.
-
-    Raises:
-        UnirenderError: one is neither True nor False.
-    """
-    for name, value in switches.items():
-        if not isinstance(value, bool | np.bool_):
-            raise UnirenderError(f"{name}: got {value!r:.60}, expected True or False")
 
 
 def check_material(material: Any) -> str:

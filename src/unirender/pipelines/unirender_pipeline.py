@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
+from unirender.arguments import check_switches
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.diffusion.sampling import Generators
@@ -41,6 +42,7 @@ from unirender.pipelines.inputs import (
     check_decomposition,
     check_rendered,
     ready_to_render,
+    report_facing_away,
     told_derived,
 )
 from unirender.pipelines.network import Overflow
@@ -50,7 +52,6 @@ from unirender.pipelines.settings import (
     Sampling,
     check_material,
     check_settings,
-    check_switches,
     list_cameras,
     same_noise,
     step_end_of,
@@ -103,7 +104,7 @@ class UniRenderPipeline(DualStreamPipeline):
         Args:
             image_srgb: display values [h w 3] in [0, 1], not premultiplied, or a PIL picture (an EXIF orientation is
                 not applied, and logged).
-            mask: coverage [h w 1] in [0, 1]; None: a PIL picture's alpha, else the whole frame.
+            mask: coverage [h w 1] in [0, 1]; None: a PIL picture's alpha, else the whole frame, which is logged once.
             camera: the contract's default if None.
             mode: `mean` (one step, the expectation) or `sample` (diffusion samples: their mean and spread).
             num_inference_steps: of `sample`; 20 if None.
@@ -211,7 +212,7 @@ class UniRenderPipeline(DualStreamPipeline):
         network = self._network(mode, sampler, size)
         views, thumbnails = [], []
         for image, mask, camera in zip(images_srgb, masks, cameras, strict=True):
-            picture, cover = as_picture(image, mask)
+            picture, cover = self._picture(image, mask)
             views.append(View(srgb_decode(picture) * cover, cover, camera))
             thumbnails.append(thumbnail(picture, cover))
         lines = self.config["calibration"]
@@ -273,6 +274,7 @@ class UniRenderPipeline(DualStreamPipeline):
         how = Sampling.of(mode, num_inference_steps, num_samples, generator, step_end=step_end)
         network = self._network(mode, sampler, size)
         (image,) = render_any_size(network, [intrinsics], how, self._report_overflow, derived, shadows)
+        report_facing_away(intrinsics)
         self.maybe_free_model_hooks()
         return image
 
@@ -287,7 +289,12 @@ class UniRenderPipeline(DualStreamPipeline):
 
         Returns:
             By name of the map; {} where nothing does.
+
+        Raises:
+            UnirenderError: as `render`.
         """
+        check_rendered(intrinsics, ())
+        check_switches(shadows=shadows)
         network = self._network()
         return network.overflow(enter(network, ready_to_render(intrinsics, shadows))[1])
 
@@ -325,7 +332,7 @@ class UniRenderPipeline(DualStreamPipeline):
         check_settings(sampling, anchored=anchored)
         if roughness is None and metallic is None:
             raise UnirenderError("edit: nothing to change, expected roughness or metallic (or both)")
-        picture, cover = as_picture(image_srgb, mask)
+        picture, cover = self._picture(image_srgb, mask)
         decomposition = self._decomposition(picture, cover, decomposition, sampling)
         before = decomposition.with_network_light
         edited, bounded, coarse = before, 0.0, None
@@ -384,7 +391,7 @@ class UniRenderPipeline(DualStreamPipeline):
         if environment is None and (specular is None or diffuse is None):
             raise UnirenderError("relight: no light, expected an environment, or both specular and diffuse")
         check_exposure(exposure)
-        picture, cover = as_picture(image_srgb, mask)
+        picture, cover = self._picture(image_srgb, mask)
         if environment is not None:
             environment = as_environment(environment)
         decomposition = self._decomposition(picture, cover, decomposition, sampling)
@@ -398,6 +405,12 @@ class UniRenderPipeline(DualStreamPipeline):
         derived = told_derived(missing, shadows)
         image = self._rerender(picture, cover, before, edited, anchored, sampling, derived)
         return EditResult(image, edited, decomposition)
+
+    def _picture(self, image: Any, mask: Any) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"]]:
+        picture, cover = as_picture(image, mask)
+        if mask is None and cover.min() == 1:
+            self._report_once("mask", "not given, nor an alpha channel: the whole frame is taken as the object")
+        return picture, cover
 
     def _decomposition(
         self,

@@ -32,6 +32,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from unirender.arguments import check_switches
 from unirender.files import new_folder, write_meta
 from unirender.intrinsics import Intrinsics
 from unirender.scene_export.card import Card
@@ -52,6 +53,7 @@ def export_scene(folder: str | Path, intrinsics: Intrinsics, *, overwrite: bool 
     Raises:
         UnirenderError: a map is missing, or the folder is in the way.
     """
+    check_switches(overwrite=overwrite)
     with new_folder(folder, overwrite=overwrite) as temporary:
         write_scene(temporary, intrinsics)
 

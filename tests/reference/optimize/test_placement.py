@@ -256,7 +256,7 @@ def test_a_close_up_that_cuts_the_object_off_needs_its_mesh(views: Views, soluti
 
     near = Views(tuple(map(cut, views.seen)))
     check_alignment(near, solution.obj)
-    with pytest.raises(UnirenderError, match=r"cuts the object off in 6 of 6 pictures .*view 0.* pass --mesh"):
+    with pytest.raises(UnirenderError, match=r"cuts the object off in 6 of 6 pictures .*view 0.* pass the mesh"):
         sphere_of_masks(near)
 
 

@@ -120,7 +120,7 @@ def open_run(out: Path, header: Mapping[str, Any]) -> Iterator[RunFolder]:
         if (state / RUN).is_file():
             _check_same(out, _read(state / RUN), wanted)
         elif any(path.name not in (LOCK, STATE) for path in out.iterdir()):
-            raise UnirenderError(f"{out}: is not empty and holds no run of this command; choose another --out")
+            raise UnirenderError(f"{out}: is not empty and holds no run of this command; choose another folder (--out)")
         else:
             state.mkdir(exist_ok=True)
             _replace(state / RUN, wanted)
@@ -172,7 +172,7 @@ def _check_same(out: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) 
         shown += f" and {len(differs) - SHOWN} more" if len(differs) > SHOWN else ""
         raise UnirenderError(
             f"{out}: holds a run with other {shown}; a run goes on with the same pictures, options and version alone: "
-            "choose another --out, or delete it"
+            "choose another folder (--out), or delete it"
         )
 
 

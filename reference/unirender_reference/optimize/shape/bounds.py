@@ -59,7 +59,8 @@ def check_reach(reach: float, count: int) -> None:
     if reach > MOST_REACH:
         raise UnirenderError(
             f"shape: the {count} masks do not bound the object: what lies inside all of them reaches {reach:.2g} times "
-            f"as far as they show it, expected at most {MOST_REACH:g}; add pictures from other sides, or pass --mesh"
+            f"as far as they show it, expected at most {MOST_REACH:g}; add pictures from other sides, or pass the mesh "
+            "(--mesh)"
         )
 
 

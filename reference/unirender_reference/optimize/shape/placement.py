@@ -61,7 +61,7 @@ def sphere_of_masks(views: Views) -> Sphere:
     if not rays or np.linalg.cond(normal_sum) > 1e4:
         raise UnirenderError(
             "views: all cameras look at the object from one side, so that its size and place are unknown; add pictures "
-            "from other sides, or pass --mesh"
+            "from other sides, or pass the mesh (--mesh)"
         )
     center = np.linalg.solve(normal_sum, point_sum)
     away = [view.name for (view, _), axis in zip(rays, axes, strict=True) if (center - view.pose[:3, 3]) @ axis <= 0]
@@ -85,7 +85,8 @@ def _check_whole(views: Views) -> None:
     if cut:
         raise UnirenderError(
             f"views: the frame cuts the object off in {len(cut)} of {len(views.seen)} pictures ({_names(cut)}); "
-            "without --mesh, expected masks that do not touch the border: leave these pictures out, or pass --mesh"
+            "without a mesh, expected masks that do not touch the border: leave these pictures out, or pass the mesh "
+            "(--mesh)"
         )
 
 

@@ -103,6 +103,10 @@ class GroupDataset:
         if derived:  # the last, as it may take long: a folder that is refused is refused before
             self.derive(progress)
 
+    def __repr__(self) -> str:
+        height, width = self.resolution
+        return f"GroupDataset({self.folder}, {len(self.keys)} groups of {height} x {width} px)"
+
     def derive(self, progress: Callable[[int, int], None] | None = None) -> None:
         """Opens s and d as derived from their light, and derives first what was not derived before.
 
