@@ -40,19 +40,12 @@ RENDERS = {  # of pictures rendered from the true maps; closed form: what our ne
 
 @dataclass(frozen=True)
 class Scored:
-    """One picture's scores.
+    """One picture's scores."""
 
-    Attributes:
-        folder: it is from.
-        group: its key there; an object may have several.
-        metallic: of the object; None: it has a map.
-        scores: by metric.
-    """
-
-    folder: str
-    group: str
-    metallic: float | None
-    scores: dict[str, float]
+    folder: str  # it is from
+    group: str  # its key there; an object may have several
+    metallic: float | None  # of the object; None: it has a map
+    scores: dict[str, float]  # by metric
 
     @property
     def object(self) -> str:

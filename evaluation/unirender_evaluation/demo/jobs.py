@@ -26,32 +26,20 @@ ARCHIVES = {
 
 @dataclass(frozen=True)
 class Context:
-    """What all jobs share.
+    """What all jobs share."""
 
-    Attributes:
-        pipeline: the model.
-        limits: of uploads.
-        meta: which model it is, for downloads.
-    """
-
-    pipeline: UniRenderPipeline
-    limits: Limits
-    meta: Mapping[str, Any] = field(default_factory=dict)
+    pipeline: UniRenderPipeline  # the model
+    limits: Limits  # of uploads
+    meta: Mapping[str, Any] = field(default_factory=dict)  # which model it is, for downloads
 
 
 @dataclass(frozen=True)
 class Opened:
-    """A picture that was taken apart.
+    """A picture that was taken apart."""
 
-    Attributes:
-        subject: to be remembered.
-        view: HTML of picture, result and light.
-        maps: HTML of the maps.
-    """
-
-    subject: Subject
-    view: str
-    maps: str
+    subject: Subject  # to be remembered
+    view: str  # HTML of picture, result and light
+    maps: str  # HTML of the maps
 
 
 def start(checkpoint: Path | None, device: Device, limits: Limits) -> Context:

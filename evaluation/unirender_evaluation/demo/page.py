@@ -31,19 +31,12 @@ Handler = Callable[..., Any]
 
 @dataclass(frozen=True)
 class Session:
-    """What is remembered of a visitor.
+    """What is remembered of a visitor."""
 
-    Attributes:
-        picture: the upload, or an example.
-        mask: the uploaded mask.
-        subject: the picture taken apart.
-        light: the uploaded light.
-    """
-
-    picture: Upload | Picture | None = None
-    mask: Upload | None = None
-    subject: Subject | None = None
-    light: Environment | None = None
+    picture: Upload | Picture | None = None  # the upload, or an example
+    mask: Upload | None = None  # the uploaded mask
+    subject: Subject | None = None  # the picture taken apart
+    light: Environment | None = None  # the uploaded light
 
 
 class Page:

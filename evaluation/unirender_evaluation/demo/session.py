@@ -39,17 +39,11 @@ Environment = Float[np.ndarray, "eh ew 3"]
 
 @dataclass(frozen=True)
 class Subject:
-    """A picture that was taken apart.
+    """A picture that was taken apart."""
 
-    Attributes:
-        picture: with a mask.
-        decomposition: of it, mode `mean`.
-        rendered: R_0, premultiplied linear.
-    """
-
-    picture: Picture
-    decomposition: Decomposition
-    rendered: Float[np.ndarray, "h w 3"]
+    picture: Picture  # with a mask
+    decomposition: Decomposition  # of it, mode `mean`
+    rendered: Float[np.ndarray, "h w 3"]  # R_0, premultiplied linear
 
     @property
     def maps(self) -> Intrinsics:
@@ -87,40 +81,24 @@ class Controls:
 
 @dataclass(frozen=True)
 class View:
-    """What is seen under some controls.
+    """What is seen under some controls."""
 
-    Attributes:
-        image_linear: premultiplied, linear, >= 0.
-        rendered: R_1, the plain render.
-        intrinsics: the maps and the light as set.
-        remarks: what the picture does not show, and why.
-    """
-
-    image_linear: Float[np.ndarray, "h w 3"]
-    rendered: Float[np.ndarray, "h w 3"]
-    intrinsics: Intrinsics
-    remarks: tuple[str, ...] = ()
+    image_linear: Float[np.ndarray, "h w 3"]  # premultiplied, linear, >= 0
+    rendered: Float[np.ndarray, "h w 3"]  # R_1, the plain render
+    intrinsics: Intrinsics  # the maps and the light as set
+    remarks: tuple[str, ...] = ()  # what the picture does not show, and why
 
 
 @dataclass(frozen=True)
 class Check:
-    """The same maps under the same light, by the model and by Mitsuba.
+    """The same maps under the same light, by the model and by Mitsuba."""
 
-    Attributes:
-        model: premultiplied linear.
-        mitsuba: the same.
-        flip: FLIP error in colours.
-        flip_mean: over the object.
-        psnr_db: inside the mask, sRGB.
-        seconds: that Mitsuba took, compilation included.
-    """
-
-    model: Float[np.ndarray, "h w 3"]
-    mitsuba: Float[np.ndarray, "h w 3"]
-    flip: Float[np.ndarray, "h w 3"]
-    flip_mean: float
-    psnr_db: float
-    seconds: float
+    model: Float[np.ndarray, "h w 3"]  # premultiplied linear
+    mitsuba: Float[np.ndarray, "h w 3"]  # the same
+    flip: Float[np.ndarray, "h w 3"]  # FLIP error in colours
+    flip_mean: float  # over the object
+    psnr_db: float  # inside the mask, sRGB
+    seconds: float  # that Mitsuba took, compilation included
 
 
 def take_apart(pipeline: UniRenderPipeline, picture: Picture) -> Subject:

@@ -36,29 +36,18 @@ HEAD = 4096  # bytes in which the sizes of .hdr and .pfm files stand
 
 @dataclass(frozen=True)
 class Limits:
-    """What is taken, and for how long a request may run.
+    """What is taken, and for how long a request may run."""
 
-    Attributes:
-        megabytes: size of a file, in millions of bytes.
-        pixels: width times height.
-        seconds: of a single request.
-    """
-
-    megabytes: float
-    pixels: int
-    seconds: float
+    megabytes: float  # size of a file, in millions of bytes
+    pixels: int  # width times height
+    seconds: float  # of a single request
 
 
 @dataclass(frozen=True)
 class Upload:
-    """A file in memory.
+    """A file in memory."""
 
-    Attributes:
-        name: as its owner calls it, without folders.
-        data: its bytes.
-    """
-
-    name: str
+    name: str  # as its owner calls it, without folders
     data: bytes
 
     @classmethod

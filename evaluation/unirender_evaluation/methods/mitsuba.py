@@ -46,15 +46,10 @@ MITSUBA = MethodInfo(
 
 @dataclass
 class MitsubaScene:
-    """One object of a suite, rendered and traced on demand; what is rendered at the truth's samples is kept.
-
-    Attributes:
-        suite: the suite.
-        scene: the object under one of its lights.
-    """
+    """One object of a suite, rendered and traced on demand; what is rendered at the truth's samples is kept."""
 
     suite: Suite
-    scene: Scene
+    scene: Scene  # the object under one of its lights
     _images: dict[str, Image] = field(default_factory=dict, repr=False)
 
     @cached_property

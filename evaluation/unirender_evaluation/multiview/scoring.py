@@ -30,17 +30,11 @@ NEIGHBOURS = (".ssim@", ".lpips_")  # metrics that would see the seams between s
 
 @dataclass(frozen=True)
 class Looks:
-    """What an object looks like from the scene's cameras.
+    """What an object looks like from the scene's cameras."""
 
-    Attributes:
-        buffers: its maps from all cameras, one below the other.
-        novel: from the held-out cameras, under the light that belongs to it.
-        relit: the same under the scene's other light.
-    """
-
-    buffers: Intrinsics
-    novel: LitPictures
-    relit: LitPictures
+    buffers: Intrinsics  # its maps from all cameras, one below the other
+    novel: LitPictures  # from the held-out cameras, under the light that belongs to it
+    relit: LitPictures  # the same under the scene's other light
 
 
 def true_looks(scene: MultiviewScene) -> Looks:

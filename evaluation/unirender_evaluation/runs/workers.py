@@ -31,25 +31,15 @@ from unirender_evaluation.versions import Versions
 
 @dataclass
 class Run:
-    """What one process needs to work on scenes: `rows` may load models, each process its own.
-
-    Attributes:
-        suite: the suite.
-        rows: the rows.
-        scenes: of the whole run.
-        versions: of the code and of what it depends on; part of every content key.
-        backbones: LPIPS backbones.
-        pictures: folder of the gallery's predictions.
-        subsets: scenes of the slow parts.
-    """
+    """What one process needs to work on scenes: `rows` may load models, each process its own."""
 
     suite: Suite
     rows: Sequence[Row]
-    scenes: list[Scene]
-    versions: Versions
-    backbones: tuple[str, ...]
-    pictures: Path
-    subsets: Subsets = STANDARD
+    scenes: list[Scene]  # of the whole run
+    versions: Versions  # of the code and of what it depends on; part of every content key
+    backbones: tuple[str, ...]  # LPIPS backbones
+    pictures: Path  # folder of the gallery's predictions
+    subsets: Subsets = STANDARD  # scenes of the slow parts
 
     def jobs(self, scene: Scene) -> Iterator[Job]:
         """Every record that the run wants of one scene, the multi-view table's aside."""

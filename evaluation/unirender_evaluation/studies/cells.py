@@ -16,17 +16,11 @@ def study_column(group: str, quantity: str, metric: Metric | str, **overrides: s
 
 @dataclass(frozen=True)
 class Cell:
-    """One number of a row.
+    """One number of a row."""
 
-    Attributes:
-        mean: over objects.
-        n: how many.
-        difference: from the row that all are compared with (None in that row itself), paired.
-    """
-
-    mean: float
-    n: int
-    difference: Estimate | None
+    mean: float  # over objects
+    n: int  # how many
+    difference: Estimate | None  # from the row that all are compared with (None in that row itself), paired
 
     @property
     def decided(self) -> bool:

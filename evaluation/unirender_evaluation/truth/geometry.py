@@ -35,15 +35,10 @@ TOLERANCES: Mapping[str, float] = {
 
 @dataclass(frozen=True)
 class GeometryTest:
-    """Differences between two traces of one object's mask, albedo and normal, by the names of `TOLERANCES`.
-
-    Attributes:
-        differences: their values.
-        factor: of all tolerances.
-    """
+    """Differences between two traces of one object's mask, albedo and normal, by the names of `TOLERANCES`."""
 
     differences: Mapping[str, float]
-    factor: float = 1.0
+    factor: float = 1.0  # of all tolerances
 
     def tolerance(self, name: str) -> float:
         """The largest difference of a name that is allowed."""

@@ -83,15 +83,10 @@ class TruthRenders:
 
 @dataclass(frozen=True)
 class Again:
-    """Renders of one object, made only where they are not kept yet.
+    """Renders of one object, made only where they are not kept yet."""
 
-    Attributes:
-        renderer: makes its `Renderer`, once.
-        kept: the renders of the whole check.
-    """
-
-    renderer: Callable[[], Any]
-    kept: TruthRenders
+    renderer: Callable[[], Any]  # makes its `Renderer`, once
+    kept: TruthRenders  # the renders of the whole check
 
     def geometry(self, name: str, spp: int, seed: int) -> Intrinsics:
         """Mask, albedo and normal of the object of that name."""

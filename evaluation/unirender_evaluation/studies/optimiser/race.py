@@ -53,21 +53,13 @@ class RaceSettings:
 
 @dataclass(frozen=True)
 class ObjectRace:
-    """The curves of one object.
+    """The curves of one object."""
 
-    Attributes:
-        key: content key.
-        object: its name.
-        start: albedo of the grey start, dB.
-        ours: our curve; its first point is the transport stage's result.
-        loops: of the plain loops.
-    """
-
-    key: str
-    object: str
-    start: float
-    ours: Curve
-    loops: tuple[Curve, ...]
+    key: str  # content key
+    object: str  # its name
+    start: float  # albedo of the grey start, dB
+    ours: Curve  # its first point is the transport stage's result
+    loops: tuple[Curve, ...]  # of the plain loops
 
     def to_json(self) -> str:
         """One line of JSON."""

@@ -30,21 +30,13 @@ USES = frozenset({MULTIVIEW, OPTIMIZER, REFERENCE})
 
 @dataclass(frozen=True)
 class Study:
-    """The objects of a study.
-
-    Attributes:
-        suite: the suite.
-        scenes: one for each object.
-        settings: cameras and samples.
-        code: versions of what its figures depend on.
-        seed: of what is compared.
-    """
+    """The objects of a study."""
 
     suite: Suite
-    scenes: tuple[Scene, ...]
-    settings: MultiviewSettings
-    code: str
-    seed: int
+    scenes: tuple[Scene, ...]  # one for each object
+    settings: MultiviewSettings  # cameras and samples
+    code: str  # versions of what its figures depend on
+    seed: int  # of what is compared
 
     @classmethod
     def of(

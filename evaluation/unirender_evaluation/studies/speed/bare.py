@@ -27,17 +27,11 @@ LAST = NUM_TIMESTEPS - 1
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of one of the parts that run side by side.
+    """Rows of one of the parts that run side by side."""
 
-    Attributes:
-        render: rows that render; they come first.
-        inverse: rows of inverse rendering.
-        cycle: of these, rows that are rendered again.
-    """
-
-    render: int
-    inverse: int
-    cycle: int
+    render: int  # rows that render; they come first
+    inverse: int  # rows of inverse rendering
+    cycle: int  # of these, rows that are rendered again
 
 
 @dataclass(frozen=True)

@@ -31,21 +31,13 @@ DIGITS = 8  # of the content key, in a folder's name
 
 @dataclass(frozen=True)
 class UnknownMesh:
-    """What is measured.
+    """What is measured."""
 
-    Attributes:
-        suite: whose objects and lights.
-        out: folder of records and results.
-        settings: cameras and samples.
-        config: of the optimisation.
-        versions: of the code, for the content keys.
-    """
-
-    suite: Suite
-    out: Path
-    settings: MultiviewSettings
-    config: OptimizeConfig
-    versions: Versions
+    suite: Suite  # whose objects and lights
+    out: Path  # folder of records and results
+    settings: MultiviewSettings  # cameras and samples
+    config: OptimizeConfig  # of the optimisation
+    versions: Versions  # of the code, for the content keys
 
     @property
     def code(self) -> str:

@@ -50,23 +50,14 @@ STEPS = Metric(
 
 @dataclass(frozen=True)
 class WarmStart:
-    """What is measured.
+    """What is measured."""
 
-    Attributes:
-        suite: whose scenes.
-        out: folder of the records.
-        base: a method with `decompose`: the prediction.
-        config: of the optimisation, cold and warm.
-        geometries: those that are given.
-        versions: of the code, for the content keys.
-    """
-
-    suite: Suite
-    out: Path
-    base: Any
-    config: SingleConfig
-    geometries: tuple[Geometry, ...]
-    versions: Versions
+    suite: Suite  # whose scenes
+    out: Path  # folder of the records
+    base: Any  # a method with `decompose`: the prediction
+    config: SingleConfig  # of the optimisation, cold and warm
+    geometries: tuple[Geometry, ...]  # those that are given
+    versions: Versions  # of the code, for the content keys
 
     def questions(self) -> Iterator[tuple[str, str]]:
         """(protocol, method) of every record of a scene."""
