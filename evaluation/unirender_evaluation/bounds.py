@@ -43,12 +43,7 @@ def ceiling_info(suite: Suite) -> MethodInfo:
 
 
 def reference_info(seed: int, scenes: int) -> MethodInfo:
-    """The row of the re-rendered truth.
-
-    Args:
-        seed: of the truth check that rendered it.
-        scenes: how many of the run's scenes it rendered.
-    """
+    """The row of the re-rendered truth."""
     return MethodInfo(
         REFERENCE_KEY,
         "Reference (other seed)",
@@ -81,13 +76,7 @@ def shade_row(scenes: int | None = None) -> Row:
 
 
 def ceiling_values(suite: Suite, task: Task, backbones: Sequence[str] = ()) -> dict[str, float]:
-    """The noise ceiling's values for one task; empty where the truth has no variance (maps).
-
-    Args:
-        suite: the suite.
-        task: the question.
-        backbones: of LPIPS.
-    """
+    """The noise ceiling's values for one task; empty where the truth has no variance (maps)."""
     values: dict[str, float] = {}
     if task.truth_image is not None and task.truth_variance is not None:
         values |= noise_ceiling(task.quantity, task.truth_image, task.truth_variance, task.mask, premultiplied=True)

@@ -91,11 +91,6 @@ def decomposition(
     """The maps that a row finds in a picture, and the seconds that they took before this call.
 
     A stranger's method decomposes a picture once, whatever tables want it.
-
-    Args:
-        row: whose.
-        seen: picture, mask and camera.
-        asked: asks the method for them.
     """
     if row.info.kind != "external":
         return asked(), 0.0
@@ -184,11 +179,6 @@ def _own(value: Any) -> Any:
 
 def _picture(result: Any, size: tuple[int, int], name: str) -> Image:
     """The picture that a stranger's method returned, as an array of float32.
-
-    Args:
-        result: what it returned.
-        size: (height, width) of the question.
-        name: of method and question, for messages.
 
     Raises:
         UnirenderError: it is no array of finite floats of that size.

@@ -112,11 +112,6 @@ def minus(found: Sequence[Scored], base: Sequence[Scored]) -> list[Scored]:
 def shard_tables(found: Sequence[Scored], what: str, titled: str = "") -> list[TextTable]:
     """Means by folder and, below each, by metallic, ± half of their intervals over objects: of maps and, where there
     are any, of renderings.
-
-    Args:
-        found: at least one.
-        what: was scored, and how, for the notes.
-        titled: ends the titles.
     """
     read = f"{what} Masked, sRGB, raw; ± half of the {INTERVAL}."
     maps = f"{read} Pictures are seen at 8 bits. Roughness and metallic: mean over the object against its number."

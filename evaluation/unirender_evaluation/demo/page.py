@@ -40,13 +40,7 @@ class Session:
 
 
 class Page:
-    """The handlers of the page's events.
-
-    Args:
-        worker: does the work.
-        limits: that the page names.
-        examples: pictures with masks, by their names.
-    """
+    """The handlers of the page's events."""
 
     def __init__(self, worker: Worker, limits: Limits, examples: Mapping[str, Picture]) -> None:
         self.worker, self.limits, self.examples = worker, limits, examples

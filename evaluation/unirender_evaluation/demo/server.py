@@ -112,11 +112,7 @@ def cleaned(page: str) -> str:
 
 
 class NothingElsewhere:
-    """ASGI middleware: `HEADERS` on every answer, and HTML without elements that name another host.
-
-    Args:
-        app: that answers.
-    """
+    """ASGI middleware: `HEADERS` on every answer, and HTML without elements that name another host."""
 
     def __init__(self, app: Callable[..., Awaitable[None]]) -> None:
         self.app = app

@@ -104,10 +104,6 @@ class Check:
 def take_apart(pipeline: UniRenderPipeline, picture: Picture) -> Subject:
     """Inverse rendering, and the rendering of what was found.
 
-    Args:
-        pipeline: the model.
-        picture: with a mask.
-
     Raises:
         UnirenderError: the picture or its mask is not usable.
     """

@@ -52,12 +52,7 @@ class Subject:
 
 
 class MitsubaTruth:
-    """Renders a suite's object under any material and light.
-
-    Args:
-        suite: names the objects.
-        spp: samples per pixel, rounded up to whole passes.
-    """
+    """Renders a suite's object under any material and light, with samples rounded up to whole passes."""
 
     def __init__(self, suite: Suite, spp: int) -> None:
         self.suite, self.spp = suite, good_spp(spp, suite.spec)

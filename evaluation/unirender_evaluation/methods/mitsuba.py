@@ -131,16 +131,7 @@ def prediction(task: Task, mitsuba: MitsubaScene) -> Prediction:
 def mitsuba_jobs(
     suite: Suite, scenes: Sequence[Scene], scene: Scene, key_of: KeyOf, backbones: Sequence[str], most: int | None
 ) -> Iterator[Job]:
-    """Mitsuba's records of one scene, the physics table's aside; possible where the object is here.
-
-    Args:
-        suite: the suite.
-        scenes: of the whole run.
-        scene: whose records are wanted.
-        key_of: makes content keys.
-        backbones: of LPIPS.
-        most: scenes of the run that the row takes part in, evenly spaced; None: all.
-    """
+    """Mitsuba's records of one scene, the physics table's aside; possible where the object is here."""
     if scene not in evenly(scenes, most):
         return
     mitsuba = MitsubaScene(suite, scene)

@@ -54,14 +54,7 @@ def solution_looks(scene: MultiviewScene, solution: Solution) -> Looks:
 def score_solution(
     scene: MultiviewScene, solution: Solution, networks: Sequence[Lpips] = (), looks: Looks | None = None
 ) -> dict[str, float]:
-    """Metric key -> value of a result.
-
-    Args:
-        scene: with its truth.
-        solution: the object that was found, in the scene's world, and its light.
-        networks: LPIPS backbones.
-        looks: `solution_looks` of it, if it is there already.
-    """
+    """Metric key -> value of a result."""
     looks = solution_looks(scene, solution) if looks is None else looks
     values = score_maps(looks.buffers.replace(normal=None, mask=None), scene.buffers)
     values = {key: value for key, value in values.items() if not any(name in key for name in NEIGHBOURS)}

@@ -73,11 +73,6 @@ def measure(suite: Suite, scenes: Sequence[Scene], ours: Any, spp: int) -> Itera
 def values_of(test: PhysicsTest, stage: Stage, asked: Mapping[str, Any]) -> list[Value]:
     """What each row scores in a test on a scene, as the table of `bench run` has it: a law that is asked of black
     pictures, or of none but clipped pixels, has no value.
-
-    Args:
-        test: the test.
-        stage: the scene.
-        asked: who answers, by the row's name.
     """
     scores = {row: test.run(subject, stage) for row, subject in asked.items()}
     key, name = stage.scene.key, stage.scene.object
@@ -85,14 +80,7 @@ def values_of(test: PhysicsTest, stage: Stage, asked: Mapping[str, Any]) -> list
 
 
 def subjects(test: PhysicsTest, tracer: PathTracer, ours: Any, sampler: Posterior | None = None) -> dict[str, Any]:
-    """Who answers a test: name of the row -> renderer, decomposer or posterior.
-
-    Args:
-        test: the test.
-        tracer: Mitsuba on the scene.
-        ours: our method.
-        sampler: our posterior; None: we have none.
-    """
+    """Who answers a test: name of the row -> renderer, decomposer or posterior."""
     if test.asks == "render":
         return {
             MITSUBA: tracer.render,
@@ -124,11 +112,7 @@ def _perfect(stage: Stage, *_: object) -> Points:
 
 
 class Sampler:
-    """The materials of a pipeline's samples; those for one picture are drawn once, since several tests ask.
-
-    Args:
-        pipeline: a `UniRenderPipeline`.
-    """
+    """The materials of a pipeline's samples; those for one picture are drawn once, since several tests ask."""
 
     def __init__(self, pipeline: Any) -> None:
         self._pipeline = pipeline

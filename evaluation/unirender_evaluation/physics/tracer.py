@@ -53,10 +53,6 @@ POSES = (
 class PathTracer:
     """Renders the maps that the physics tests make of one scene, all with one seed, as `shade` does: what is linear
     in the samples comes out exactly, the rest to within noise.
-
-    Args:
-        stage: the scene.
-        spp: samples per pixel.
     """
 
     def __init__(self, stage: Stage, spp: int) -> None:

@@ -68,13 +68,6 @@ def run_check(
 
     Where no scene is asked for, or no object of the suite is here, its truth is not rendered again: `passed` is None,
     and no file is written.
-
-    Args:
-        request: what is to be checked.
-        here: the run.
-        store: of the run.
-        progress: gets a bar while Mitsuba renders.
-        say: prints one line.
     """
     if not request.scenes:
         return _none("--check-scenes 0", "--check-scenes 0")
@@ -122,13 +115,7 @@ def _none(reason: str, unchecked: str) -> dict[str, Any]:
 
 
 def stored_check(request: CheckRequest, here: Run, known: Collection[str]) -> dict[str, Any] | None:
-    """The check in the run's folder, if it is the one that is asked for.
-
-    Args:
-        request: what is to be checked.
-        here: the run.
-        known: content keys of the records in its folder.
-    """
+    """The check in the run's folder, if it is the one that is asked for."""
     stored = read_check(request.path)
     complete = all(key in known for key in stored.get("records", {}))
     same = stored.get("identity") == _identity(request, here) and request.seed in (None, stored.get("seed"))

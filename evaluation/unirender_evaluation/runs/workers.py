@@ -119,10 +119,6 @@ def _start(setup: _Setup) -> None:
 def same_rows(rows: Sequence[Row], configs: Mapping[str, Any]) -> Sequence[Row]:
     """The rows as they are, if they are those of the process that asks.
 
-    Args:
-        rows: made here.
-        configs: made there, by the rows' keys.
-
     Raises:
         UnirenderError: a row has another configuration here, so that its records would have other keys.
     """
@@ -157,9 +153,6 @@ def _scene(key: str) -> UnirenderError | None:
 class Journals:
     """The records that worker processes have made, each in a file of its own: a queue is left locked, or with half a
     record, by a process that is killed while it writes.
-
-    Args:
-        folder: of the files.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -61,11 +61,6 @@ class GeometryTest:
 def compare_geometry(stored: Intrinsics, again: Intrinsics, spp: int = TOLERANCE_SPP) -> GeometryTest:
     """Compares two traces of mask, albedo and normal: strictly inside, where both cover the pixel, loosely at edges.
 
-    Args:
-        stored: a trace.
-        again: another one.
-        spp: samples per pixel of each.
-
     Raises:
         UnirenderError: the object covers no pixel in either.
     """

@@ -231,11 +231,6 @@ def pack_truth(spec: SuiteSpec, text: str, parts: Iterable[Path], lights: Mappin
 def with_sha256(text: str, path: Path, digest: str) -> str:
     """The text of a suite's TOML file with another hash of its truth; comments and layout stay.
 
-    Args:
-        text: of the file.
-        path: of the file, for the message.
-        digest: the hash.
-
     Raises:
         UnirenderError: there is not exactly one line `sha256 = "..."`.
     """

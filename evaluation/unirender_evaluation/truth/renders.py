@@ -41,12 +41,7 @@ class TruthRenders:
     folder: Path | None = None
 
     def of(self, name: str, make: Callable[[], Arrays]) -> Arrays:
-        """The arrays of a render.
-
-        Args:
-            name: of the render and of all that it depends on.
-            make: renders it.
-        """
+        """The arrays of a render."""
         if self.folder is None:
             return make()
         path = self.folder / f"{hashlib.sha256(name.encode()).hexdigest()[:32]}.npz"

@@ -63,12 +63,7 @@ class Finish:
 
 
 def finish(ours: Curve, loops: Sequence[Curve]) -> Finish:
-    """The race of one curve against the faster of several plain loops.
-
-    Args:
-        ours: our curve.
-        loops: of the plain loops, without the start.
-    """
+    """The race of one curve against the faster of several plain loops."""
     target = max(loop.best.psnr for loop in loops)
     times = {loop.name: seconds for loop in loops if (seconds := loop.reaches(target)) is not None}
     plain = min(times, key=lambda name: times[name])

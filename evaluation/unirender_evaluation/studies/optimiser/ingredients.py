@@ -37,11 +37,7 @@ class Ingredient:
 
 
 def ingredients(seed: int = 0) -> tuple[Ingredient, ...]:
-    """All rows, the full method first.
-
-    Args:
-        seed: of the optimiser.
-    """
+    """All rows, the full method first."""
     full = OptimizeConfig(seed=seed)
 
     def start(name: str, label: str, **changes: Any) -> Ingredient:

@@ -46,10 +46,6 @@ class Line:
 def summarise(rows: Sequence[Ingredient], records: Sequence[Record]) -> list[Line]:
     """The lines of the table, from records of all rows.
 
-    Args:
-        rows: the full method among them.
-        records: of these rows.
-
     Raises:
         UnirenderError: a row has no record in common with the full method, or a difference is infinite.
     """
@@ -74,13 +70,7 @@ def settings_text(row: Ingredient, full: Ingredient) -> str:
 
 
 def tables(lines: Sequence[Line], settings: bool, shown: slice = EVERY) -> list[TextTable]:
-    """A table for each group, the full method first in each.
-
-    Args:
-        lines: the full method among them.
-        settings: whether to show what of the configuration is different, as Markdown.
-        shown: which of the columns.
-    """
+    """A table for each group, the full method first in each; `settings` shows what is configured otherwise."""
     full = next(line for line in lines if line.row.name == FULL)
     titles = [f"{column.group} {header(column)}" for column in columns()[shown]]
 

@@ -158,12 +158,7 @@ def pool(found: Sequence[Calibration]) -> Pooled:
 
 
 def scene_calibration(samples: Sequence[Intrinsics], truth: Intrinsics) -> dict[str, Calibration]:
-    """Every map that samples and truth have, of one scene.
-
-    Args:
-        samples: at least two decompositions of one picture.
-        truth: with its mask.
-    """
+    """Every map that samples and truth have, of one scene."""
     found = {}
     for name in MAPS:
         target = getattr(truth, name)

@@ -67,15 +67,7 @@ def cut_batch(config: TrainConfig, parallel: int) -> list[Rows]:
 
 
 class BarePasses:
-    """Runs the passes of a batch when it is called.
-
-    Args:
-        model: the network.
-        conditioning: of it; gives the shapes.
-        config: batch and loss.
-        parallel: parts side by side.
-        dtype: of the autocast; float32: none.
-    """
+    """Runs the passes of a batch when it is called."""
 
     def __init__(
         self, model: DualStreamModel, conditioning: Conditioning, config: TrainConfig, parallel: int, dtype: torch.dtype

@@ -29,14 +29,6 @@ def throughput(
 ) -> tuple[list[dict[str, float]], int]:
     """Samples/s of both, a dict a turn with `trained`, `bare` and their `ratio`; and how many parts ran side by side.
 
-    Args:
-        data: folder of shards.
-        config: the preset.
-        device: to train on.
-        dtype: of the autocast.
-        steps: of a block.
-        turns: that count.
-
     Raises:
         UnirenderError: unusable shards, or pictures of another size than the preset's.
     """

@@ -39,11 +39,6 @@ class Choice:
 def training_choices(seed: int = 0, batch_size: int | None = None, preset: str = BASE_PRESET) -> tuple[Choice, ...]:
     """All rows, the one that the others are changes of first; without those that another row is already.
 
-    Args:
-        seed: of weights, data order and noise.
-        batch_size: instead of the preset's.
-        preset: what every row begins with.
-
     Raises:
         UnirenderError: no such preset.
     """

@@ -45,11 +45,7 @@ class BenchTraining:
     """Seed of weights, data order and noise."""
 
     def check(self) -> None:
-        """Looks at the values.
-
-        Raises:
-            UsageError: one is outside its range.
-        """
+        """Looks at the values; `UsageError` where one is outside its range."""
         at_least(1, scenes=self.scenes, steps=self.steps, batch_size=self.batch_size, parallel=self.parallel)
         at_least(0, seed=self.seed)
 

@@ -143,14 +143,7 @@ def measure(study: TrainingStudy, rows: Sequence[Choice], scenes: Sequence[Scene
 
 
 def run(study: TrainingStudy, rows: Sequence[Choice], scenes: Sequence[Scene], console: Console) -> list[Record]:
-    """Trains and measures what is missing and writes `training.md` and `training.json`.
-
-    Args:
-        study: the measurement.
-        rows: the plain model among them.
-        scenes: at least one.
-        console: for progress and tables.
-    """
+    """Trains and measures what is missing and writes `training.md` and `training.json`."""
     with open_folder(study.out):
         records, computed = [], 0
         for record, new in measure(study, rows, scenes):

@@ -59,13 +59,7 @@ class UnknownMesh:
 def measure(
     what: UnknownMesh, scenes: Sequence[Scene], progress: Callable[[Scene], OnReport | None] = lambda scene: None
 ) -> Iterator[tuple[Record, bool]]:
-    """The records of scenes, and whether each was measured now; those that are stored are not measured again.
-
-    Args:
-        what: the measurement.
-        scenes: of the suite.
-        progress: for a scene, what hears of every step.
-    """
+    """The records of scenes, and whether each was measured now; those that are stored are not measured again."""
     store = Store.open(what.out / "records.jsonl")
     for scene in scenes:
         key = what.key(scene)

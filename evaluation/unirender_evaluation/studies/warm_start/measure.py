@@ -134,12 +134,7 @@ class Case:
         return options
 
     def scores(self, found: Intrinsics, geometry: Any) -> dict[str, float]:
-        """Maps, light, and the renders under both lights.
-
-        Args:
-            found: maps and light.
-            geometry: the mesh, whose shadows are in the renders; None: without shadows.
-        """
+        """Maps, light, and the renders under both lights, with the shadows of a mesh (`geometry`) or without."""
         from unirender_reference.shade import shade
 
         mask, camera = self._seen["mask"], self._seen["camera"]
