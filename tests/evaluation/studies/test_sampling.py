@@ -20,11 +20,12 @@ from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record
 from unirender_evaluation.rows import evenly
 from unirender_evaluation.statistics import UNPRINTED
+from unirender_evaluation.studies.cells import difference
 from unirender_evaluation.studies.sampling import run as run_module
 from unirender_evaluation.studies.sampling.calibration import Calibration, calibrate, pool
 from unirender_evaluation.studies.sampling.command import BenchSampling
 from unirender_evaluation.studies.sampling.measure import DECOMPOSE, MEAN, RENDER, Case, SamplingStudy, Setting, measure
-from unirender_evaluation.studies.sampling.plots import PANELS, draw_reliability, from_mean
+from unirender_evaluation.studies.sampling.plots import PANELS, draw_reliability
 from unirender_evaluation.studies.sampling.run import run
 from unirender_evaluation.studies.sampling.tables import COLUMNS, calibration_table, headline, quality_table, tables
 from unirender_evaluation.versions import MODEL, Versions
@@ -244,13 +245,13 @@ def test_the_plot_over_steps_pairs_by_picture() -> None:
         for own, values in scores.items()
         for k, value in enumerate(values)
     ]
-    found = from_mean(made, setting, column)
+    found = difference(made, setting.key, MEAN.key, column)
     assert found is not None
     assert (found.mean, found.n) == (-0.5, 3)
     assert found.half_width == pytest.approx(0, abs=1e-12)
-    assert from_mean(made[:3], setting, column) is None
+    assert difference(made[:3], setting.key, MEAN.key, column) is None
     infinite = replace(made[-1], values={column.key(DEFAULT_VARIANT): math.inf})
-    assert from_mean([*made[:-1], infinite], setting, column) is None
+    assert difference([*made[:-1], infinite], setting.key, MEAN.key, column) is None
 
 
 def test_every_option_reaches_the_study(what: SamplingStudy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

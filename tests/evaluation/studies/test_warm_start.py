@@ -15,10 +15,11 @@ from unirender.errors import UsageError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record
+from unirender_evaluation.studies.cells import difference
 from unirender_evaluation.studies.warm_start.command import BenchWarmStart
 from unirender_evaluation.studies.warm_start.measure import COLD, PICTURE, PREDICTION, WARM, Case, WarmStart, measure
 from unirender_evaluation.studies.warm_start.run import our_method, run
-from unirender_evaluation.studies.warm_start.tables import COLUMNS, block, difference, tables
+from unirender_evaluation.studies.warm_start.tables import COLUMNS, block, tables
 from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.versions import MODEL, MULTIVIEW, OPTIMIZER, REFERENCE, Versions
 from unirender_reference.optimize.single.config import SingleConfig
