@@ -49,14 +49,6 @@ class PhysicsTest:
         """The metric key of its value."""
         return metric_key(self.name, self.metric)
 
-    @property
-    def unit(self) -> str:
-        return self.metric.unit
-
-    @property
-    def direction(self) -> str:
-        return "higher is better" if self.metric.higher_is_better else "lower is better"
-
     def fails(self, value: float, mitsuba: float) -> bool:
         """Whether a value is worse than Mitsuba's by more than the margin."""
         return (mitsuba - value if self.metric.higher_is_better else value - mitsuba) > self.margin

@@ -172,7 +172,8 @@ def markdown(found: Sequence[Finding], settings: dict[str, Any]) -> str:
         expected = test.expected if isinstance(test.expected, str) else f"{test.expected:g}"
         cells = [estimate_text(finding.rows.get(row), test.metric.decimals) for row in ROWS]
         verdict = "PASS" if finding.refused else "FAIL"
-        heading = f"{test.label} ({test.metric.label}{f', {test.unit}' if test.unit else ''}) {test.metric.arrow}"
+        unit = f", {test.metric.unit}" if test.metric.unit else ""
+        heading = f"{test.label} ({test.metric.label}{unit}) {test.metric.arrow}"
         lines.append(markdown_row((heading, expected, *cells, f"{verdict}: {test.twin_is}")))
     protocol = " · ".join(f"{name}: {value}" for name, value in settings.items())
     notes = unprinted_note(estimate for finding in found for estimate in finding.rows.values())
@@ -187,8 +188,8 @@ def write(out: Path, values: Sequence[Value], settings: dict[str, Any]) -> list[
         {
             "name": f.test.name,
             "formula": f.test.formula,
-            "unit": f.test.unit,
-            "direction": f.test.direction,
+            "unit": f.test.metric.unit,
+            "direction": "higher is better" if f.test.metric.higher_is_better else "lower is better",
             "expected": f.test.expected,
             "margin": f.test.margin,
             "twin": f.test.twin_is,
