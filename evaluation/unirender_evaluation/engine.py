@@ -98,11 +98,7 @@ def decomposition(
 
 
 def check_picture(row: Row, task: Task, image: Image | None) -> None:
-    """Refuses a stranger's picture in other units or conventions, whose score would say nothing of it.
-
-    Raises:
-        UnirenderError: see `plausible.picture_doubt`.
-    """
+    """Refuses a stranger's picture in other units or conventions, whose score would say nothing of it."""
     if image is None or (doubt := picture_doubt(image, task.mask)) is None:
         return
     raise UnirenderError(
@@ -178,11 +174,7 @@ def _own(value: Any) -> Any:
 
 
 def _picture(result: Any, size: tuple[int, int], name: str) -> Image:
-    """The picture that a stranger's method returned, as an array of float32.
-
-    Raises:
-        UnirenderError: it is no array of finite floats of that size.
-    """
+    """The picture that a stranger's method returned, as an array of float32."""
     expected = f"expected finite linear radiance, floats of shape {(*size, 3)}"
     try:
         picture = np.asarray(result)

@@ -43,32 +43,20 @@ class Opened:
 
 
 def start(checkpoint: Path | None, device: Device, limits: Limits) -> Context:
-    """Loads the model.
-
-    Raises:
-        UnirenderError: no such checkpoint.
-    """
+    """Loads the model."""
     options = ModelOptions(checkpoint, device, progress=False)
     pipeline = options.load()
     return Context(pipeline, limits, options.provenance(pipeline))
 
 
 def open_upload(context: Context, picture: Upload, mask: Upload | None, side: int) -> Opened:
-    """Takes a visitor's picture apart.
-
-    Raises:
-        UnirenderError: a file cannot be used.
-    """
+    """Takes a visitor's picture apart."""
     found, remarks = read_upload(picture, mask, context.limits)
     return open_picture(context, found, side, remarks)
 
 
 def open_picture(context: Context, picture: Picture, side: int, remarks: tuple[str, ...] = ()) -> Opened:
-    """Takes a picture with a mask apart.
-
-    Raises:
-        UnirenderError: it cannot be used.
-    """
+    """Takes a picture with a mask apart."""
     subject = session.take_apart(context.pipeline, square(picture, side))
     seen = session.view(context.pipeline, subject, Controls())
     noted = session.View(seen.image_linear, seen.rendered, seen.intrinsics, remarks)
@@ -76,11 +64,7 @@ def open_picture(context: Context, picture: Picture, side: int, remarks: tuple[s
 
 
 def open_light(context: Context, light: Upload) -> Environment:
-    """Reads a visitor's light.
-
-    Raises:
-        UnirenderError: the file cannot be used.
-    """
+    """Reads a visitor's light."""
     return read_light(light, context.limits)
 
 

@@ -162,11 +162,7 @@ def refusing(handler: Handler) -> Handler:
 
 
 def opened_subject(session: Session) -> Subject:
-    """The picture that is open.
-
-    Raises:
-        UnirenderError: there is none.
-    """
+    """The picture that is open."""
     if session.subject is None:
         raise UnirenderError(NOTHING)
     return session.subject
@@ -175,11 +171,7 @@ def opened_subject(session: Session) -> Subject:
 def read_controls(
     session: Session, metallic: float, roughness: float, light: str, turn_deg: float, anchored: bool
 ) -> Controls:
-    """What the controls say; a slider at the predicted value changes nothing.
-
-    Raises:
-        UnirenderError: an own light is chosen, and there is none.
-    """
+    """What the controls say; a slider at the predicted value changes nothing."""
     found = opened_subject(session).decomposition
     if light == OWN and session.light is None:
         raise UnirenderError("Drop in a light of your own first.")

@@ -102,11 +102,7 @@ class Check:
 
 
 def take_apart(pipeline: UniRenderPipeline, picture: Picture) -> Subject:
-    """Inverse rendering, and the rendering of what was found.
-
-    Raises:
-        UnirenderError: the picture or its mask is not usable.
-    """
+    """Inverse rendering, and the rendering of what was found."""
     decomposition = pipeline.decompose(picture.image_srgb, picture.mask)
     return Subject(picture, decomposition, render(pipeline, decomposition.with_network_light))
 
@@ -116,9 +112,6 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
 
     Under the predicted light as it stands, s follows the new roughness as in `UniRenderPipeline.edit`; under any other
     s and d are derived from the normals, as in `UniRenderPipeline.relight`.
-
-    Raises:
-        UnirenderError: a number is outside its range, or the light is not usable.
     """
     before = subject.decomposition.with_network_light
     edited, remarks, derived = before, [], ()
@@ -165,11 +158,7 @@ def turned(environment: Environment, turn_deg: float) -> Environment:
 
 
 def check(seen: View, spp: int = SPP) -> Check:
-    """Mitsuba shades the maps that the model rendered, under the light that is shown with them.
-
-    Raises:
-        UnirenderError: Mitsuba cannot run here, or the light is not usable.
-    """
+    """Mitsuba shades the maps that the model rendered, under the light that is shown with them."""
     mask = seen.intrinsics.require("mask")["mask"]
     start = time.perf_counter()
     truth = shade(seen.intrinsics, spp=spp)

@@ -52,11 +52,7 @@ class Upload:
 
     @classmethod
     def take(cls, path: str | Path) -> "Upload":
-        """Reads a file and deletes it.
-
-        Raises:
-            UnirenderError: it is not there.
-        """
+        """Reads a file and deletes it."""
         path = Path(path)
         try:
             data = path.read_bytes()
@@ -85,11 +81,7 @@ def read_upload(picture: Upload, mask: Upload | None, limits: Limits) -> tuple[P
 
 
 def square(picture: Picture, side: int) -> Picture:
-    """The object in the middle of a square of `side` pixels.
-
-    Raises:
-        UnirenderError: another side than one of `SIDES`.
-    """
+    """The object in the middle of a square of `side` pixels."""
     if side not in SIDES:
         raise UnirenderError(f"resolution: got {side}, expected one of {', '.join(map(str, SIDES))} pixels")
     return framed(picture, side)
@@ -110,11 +102,7 @@ def read_light(light: Upload, limits: Limits) -> Float[np.ndarray, "eh ew 3"]:
 
 @contextlib.contextmanager
 def _as_file(upload: Upload, limits: Limits) -> Iterator[Path]:
-    """The upload as a file of its name, for readers; its errors name no folder.
-
-    Raises:
-        UnirenderError: it has more bytes or pixels than the limits allow.
-    """
+    """The upload as a file of its name, for readers; its errors name no folder."""
     check_size(upload, limits)
     with tempfile.TemporaryDirectory(prefix="unirender-demo-") as folder:
         path = Path(folder) / upload.name
@@ -126,11 +114,7 @@ def _as_file(upload: Upload, limits: Limits) -> Iterator[Path]:
 
 
 def check_size(upload: Upload, limits: Limits) -> None:
-    """Looks at the size of a file and of the picture in it, without decoding it.
-
-    Raises:
-        UnirenderError: it is above the limits.
-    """
+    """Looks at the size of a file and of the picture in it, without decoding it."""
     if len(upload.data) > limits.megabytes * 1e6:
         raise UnirenderError(
             f"{upload.name}: {len(upload.data) / 1e6:.1f} MB, expected at most {limits.megabytes:g} MB; scale it down "

@@ -84,11 +84,7 @@ class Figures:
             self.check_pictures()
 
     def check_pictures(self) -> None:
-        """Looks at what stands beside --pictures.
-
-        Raises:
-            UsageError: it is not about pictures of one's own.
-        """
+        """Looks at what stands beside --pictures."""
         strips, fields = self.strips(), type(self).__dataclass_fields__
         if self.kinds != KINDS and set(strips) != set(self.kinds):
             raise UsageError(

@@ -59,11 +59,7 @@ class MitsubaTruth:
         self._objects: dict[str, MitsubaScene] = {}
 
     def __call__(self, scene: Scene, material: MetallicRoughness, environment: Float[np.ndarray, "eh ew 3"]) -> Image:
-        """Linear image, premultiplied.
-
-        Raises:
-            UnirenderError: the generator makes another object here than the suite was rendered from.
-        """
+        """Linear image, premultiplied."""
         seed = item_seed("figures", scene.key, material)
         metallic, roughness = material
         found = self._object(scene).renderer.image(environment, roughness, metallic, self.spp, seed)
@@ -131,11 +127,7 @@ def relighting_grid(
 
 
 def other_lights(suite: Suite, scenes: Sequence[Scene], count: int) -> list[Scene]:
-    """Scenes whose lights are not those of `scenes`: each light once, evenly spaced over the suite.
-
-    Raises:
-        UnirenderError: the suite has no other light.
-    """
+    """Scenes whose lights are not those of `scenes`: each light once, evenly spaced over the suite."""
     own = {scene.light for scene in scenes}
     found = {scene.light: scene for scene in reversed(suite.scenes) if scene.light not in own}
     if not found:

@@ -117,11 +117,7 @@ def _start(setup: _Setup) -> None:
 
 
 def same_rows(rows: Sequence[Row], configs: Mapping[str, Any]) -> Sequence[Row]:
-    """The rows as they are, if they are those of the process that asks.
-
-    Raises:
-        UnirenderError: a row has another configuration here, so that its records would have other keys.
-    """
+    """The rows as they are, if they are those of the process that asks."""
     for row in rows:
         if row.config != configs.get(row.info.key):
             raise UnirenderError(

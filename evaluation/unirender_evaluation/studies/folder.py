@@ -14,11 +14,7 @@ from unirender_reference.folder_lock import locked, made_folder
 
 @contextlib.contextmanager
 def open_folder(path: Path) -> Iterator[Path]:
-    """A folder to write to, made if it is not there, and held against a second run.
-
-    Raises:
-        UnirenderError: it cannot be made, or another run writes to it.
-    """
+    """A folder to write to, made if it is not there, and held against a second run."""
     with made_folder(path), locked(path):
         yield path
 

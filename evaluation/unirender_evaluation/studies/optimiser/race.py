@@ -211,11 +211,7 @@ def run_race(scene: MultiviewScene, settings: RaceSettings, key: str, name: str)
 
 
 def read_curves(path: Path) -> list[ObjectRace]:
-    """What earlier runs stored; half a line at the end, left by a killed run, is cut off.
-
-    Raises:
-        UnirenderError: a line is none of a race.
-    """
+    """What earlier runs stored; half a line at the end, left by a killed run, is cut off."""
     text = path.read_text(encoding="utf-8") if path.exists() else ""
     complete = text[: text.rfind("\n") + 1]
     if complete != text:

@@ -43,11 +43,7 @@ class Line:
 
 
 def summarise(rows: Sequence[Ingredient], records: Sequence[Record]) -> list[Line]:
-    """The lines of the table, from records of all rows.
-
-    Raises:
-        UnirenderError: a row has no record in common with the full method, or a difference is infinite.
-    """
+    """The lines of the table, from records of all rows."""
     return [Line(row, row_cells(records, row.name, FULL, columns())) for row in rows]
 
 

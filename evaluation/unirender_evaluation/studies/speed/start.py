@@ -104,11 +104,7 @@ def cold_starts(
 
 
 def run_process(arguments: Sequence[str], folder: Path) -> float:
-    """Wall clock in seconds of Python with these arguments.
-
-    Raises:
-        UnirenderError: it fails.
-    """
+    """Wall clock in seconds of Python with these arguments."""
     start = time.perf_counter()
     done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     seconds = time.perf_counter() - start

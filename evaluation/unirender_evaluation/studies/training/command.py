@@ -73,11 +73,7 @@ class BenchTraining:
         return 0
 
     def _possible(self, rows: "Sequence[Choice]") -> "tuple[Choice, ...]":
-        """The rows that can be trained on the data; says which are left out.
-
-        Raises:
-            UnirenderError: one of those asked for by name cannot.
-        """
+        """The rows that can be trained on the data; says which are left out."""
         from unirender.training.data.contrasts import ContrastDataset
 
         possible = []
