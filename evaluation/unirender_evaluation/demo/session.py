@@ -62,21 +62,13 @@ class Subject:
 
 @dataclass(frozen=True)
 class Controls:
-    """What a visitor has set.
+    """What a visitor has set."""
 
-    Attributes:
-        metallic: of the whole object, [0, 1]; None: as predicted.
-        roughness: the same.
-        light: lat-long radiance in camera axes, any scale; None: the one that was found, which agrees with s and d.
-        turn_deg: by which the light is turned about +y, from +z towards +x.
-        anchored: whether the change is applied to the picture; else the plain render is shown.
-    """
-
-    metallic: float | None = None
-    roughness: float | None = None
-    light: Environment | None = None
-    turn_deg: float = 0.0
-    anchored: bool = True
+    metallic: float | None = None  # of the whole object, [0, 1]; None: as predicted
+    roughness: float | None = None  # the same
+    light: Environment | None = None  # lat-long, camera axes, any scale; None: the one found, which agrees with s and d
+    turn_deg: float = 0.0  # by which the light is turned about +y, from +z towards +x
+    anchored: bool = True  # whether the change is applied to the picture; else the plain render is shown
 
 
 @dataclass(frozen=True)

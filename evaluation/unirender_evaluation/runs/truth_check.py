@@ -41,19 +41,12 @@ DRAWS = 1000  # of a seed whose scenes meet those of a limited run
 
 @dataclass(frozen=True)
 class CheckRequest:
-    """What is to be checked.
+    """What is to be checked."""
 
-    Attributes:
-        path: of `truth_check.json`.
-        scenes: how many; 0 = nothing is checked.
-        seed: chooses them and the render seeds; None = that of the stored check, or one drawn at random.
-        again: render also where the stored check would do.
-    """
-
-    path: Path
-    scenes: int
-    seed: int | None = None
-    again: bool = False
+    path: Path  # of `truth_check.json`
+    scenes: int  # how many; 0 = nothing is checked
+    seed: int | None = None  # of scenes and renders; None = that of the stored check, or one drawn at random
+    again: bool = False  # render also where the stored check would do
 
     @property
     def renders(self) -> TruthRenders:

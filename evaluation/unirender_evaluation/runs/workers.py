@@ -64,27 +64,18 @@ class Run:
 
 @dataclass(frozen=True)
 class _Setup:
-    """What a process of this machine needs to make a `Run` like the caller's; it pickles.
+    """What a process of this machine needs to make a `Run` like the caller's; it pickles."""
 
-    Attributes:
-        build: makes the rows, which have to have these `configs`, by their keys.
-        suite: path of its TOML file.
-        scenes: their keys.
-        versions, backbones, pictures, subsets: as in `Run`.
-        known: content keys of records that are there.
-        notes: folder in which each process says what it has under way, and hands over its records (`Journals`).
-    """
-
-    build: Callable[[], Sequence[Row]]
-    configs: Mapping[str, Any]
-    suite: Path
-    scenes: tuple[str, ...]
+    build: Callable[[], Sequence[Row]]  # makes the rows
+    configs: Mapping[str, Any]  # that these rows have to have, by their keys
+    suite: Path  # path of its TOML file
+    scenes: tuple[str, ...]  # their keys
     versions: Versions
     backbones: tuple[str, ...]
     pictures: Path
     subsets: Subsets
-    known: frozenset[str]
-    notes: Path
+    known: frozenset[str]  # content keys of records that are there
+    notes: Path  # folder in which each process says what it has under way, and hands over its records (`Journals`)
 
     def run(self) -> Run:
         suite, rows = load_suite(self.suite), same_rows(self.build(), self.configs)

@@ -34,21 +34,13 @@ CURVES = "curves.jsonl"
 
 @dataclass(frozen=True)
 class RaceSettings:
-    """What runs.
-
-    Attributes:
-        ours: our optimiser.
-        iterations: of the plain loop.
-        losses: of the plain loop, a run each; the one that is first at the best albedo of them all counts.
-        plain_every: iterations of the plain loop between two measures.
-        our_every: iterations of our refinement between two measures.
-    """
+    """What runs; of the plain losses the one counts that is first at the best albedo of them all."""
 
     ours: OptimizeConfig
-    iterations: int = 400
-    losses: tuple[str, ...] = ("srgb", "linear")
-    plain_every: int = 20
-    our_every: int = 5
+    iterations: int = 400  # of the plain loop
+    losses: tuple[str, ...] = ("srgb", "linear")  # of the plain loop, a run each
+    plain_every: int = 20  # iterations of the plain loop between two measures
+    our_every: int = 5  # iterations of our refinement between two measures
 
 
 @dataclass(frozen=True)
