@@ -10,7 +10,7 @@ from synthetic_shards import write_dataset
 from tiny_models import SIZE, TRAIN
 from tiny_suites import make_suite
 
-from unirender.errors import UnirenderError, UsageError
+from unirender.errors import UnirenderError
 from unirender.models.config import ModelConfig
 from unirender.training.presets import PRESETS
 from unirender_evaluation.metrics import DEFAULT_VARIANT
@@ -95,11 +95,6 @@ def test_every_option_reaches_the_study(tmp_path: Path, monkeypatch: pytest.Monk
     assert rows[0].config.optimizer == PRESETS["tiny_muon"].optimizer
 
 
-def test_wrong_names_end_before_anything_is_read(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"--choices no-such: expected some of plain, .*, or the groups chance"):
-        BenchTraining(data=tmp_path / "none", choices=("cycle", "no-such")).run()
-
-
 @pytest.mark.long
 def test_every_row_is_scored_on_every_scene(records: list[Record]) -> None:
     """With all columns of the table."""
@@ -161,13 +156,6 @@ def test_the_file_of_one_object_is_strict_json() -> None:
     content = json.loads(to_json(rows, made, {}), parse_constant=pytest.fail)
     cell = content["rows"]["seed"]["cells"][keys[0]]
     assert cell["difference"] == {"mean": 0.0, "low": None, "high": None, "n": 2, "objects": 1}
-
-
-@pytest.mark.parametrize("option", [{"steps": 0}, {"scenes": 0}, {"batch_size": 0}, {"seed": -1}])
-def test_values_out_of_range_are_usage_errors(option: dict[str, int], tmp_path: Path) -> None:
-    name = next(iter(option)).replace("_", "-")
-    with pytest.raises(UsageError, match=f"--{name}"):
-        BenchTraining(data=tmp_path, **option).run()  # pyright: ignore[reportArgumentType] - all are integers
 
 
 def test_missing_data_is_named(tmp_path: Path) -> None:

@@ -36,7 +36,11 @@ class BenchDerivedLight:
     """Pixels along each side."""
 
     def check(self) -> None:
-        """Looks at the values; `UsageError` where one is outside its range, or given twice."""
+        """Looks at the values.
+
+        Raises:
+            UsageError: one is outside its range, or given twice.
+        """
         at_least(LEAST_SIZE, resolution=self.resolution)
         given = {"lights": self.lights, "roughness": self.roughness, "objects": self.objects}
         for name, values in given.items():
