@@ -243,14 +243,7 @@ def method_jobs(
 ) -> Iterator[Job]:
     """Every question about one scene to every row that answers it; row innermost, so that rows share decompositions.
 
-    Args:
-        suite: the suite.
-        rows: the rows.
-        scenes: of the whole run: rows on a subset choose from them.
-        scene: whose questions are asked.
-        versions: of the code and of what it depends on.
-        backbones: LPIPS backbones.
-        pictures: keeps the predictions of the gallery.
+    `scenes` are those of the whole run: rows on a subset choose from them.
     """
     for table, protocol in PROTOCOLS:
         for task in tasks(suite, table, protocol, [scene]):

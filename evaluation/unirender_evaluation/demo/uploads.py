@@ -63,12 +63,8 @@ class Upload:
 
 
 def read_upload(picture: Upload, mask: Upload | None, limits: Limits) -> tuple[Picture, tuple[str, ...]]:
-    """A picture with a mask, and remarks on what was assumed and what the picture cannot show.
-
-    Args:
-        picture: PNG, JPG or EXR.
-        mask: picture of the coverage; None: the alpha channel, else the whole frame.
-        limits: of both files.
+    """A picture with a mask (None: its alpha channel, else the whole frame), and remarks on what was assumed and what
+    it cannot show.
 
     Raises:
         UnirenderError: a file is too large, or no readable picture; or the mask does not fit or is empty.

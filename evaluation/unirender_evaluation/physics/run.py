@@ -54,14 +54,7 @@ class Value:
 
 
 def measure(suite: Suite, scenes: Sequence[Scene], ours: Any, spp: int) -> Iterator[list[Value]]:
-    """The values of one test after another, scene by scene.
-
-    Args:
-        suite: the suite.
-        scenes: whose objects the generator makes here as the truth shows them.
-        ours: our method, with `render` and `decompose`; its `pipeline` samples.
-        spp: samples per pixel of Mitsuba's path tracer.
-    """
+    """The values of one test after another, scene by scene; `ours` renders and decomposes, its `pipeline` samples."""
     sampler = Sampler(ours.pipeline)
     for scene in scenes:
         stage = Stage(suite, scene)

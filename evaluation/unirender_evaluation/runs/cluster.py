@@ -90,12 +90,7 @@ def run_on_cluster(
 ) -> Generator[list[Record], None, None]:
     """Records of scenes from a cluster's workers, a scene at a time as they come; pictures are written here.
 
-    Args:
-        run: what the run is.
-        build: makes the rows in each worker.
-        suite: see `Order`.
-        wanted: scene -> content keys of its records.
-        address: see `unirender_reference.cluster.connect`.
+    `wanted` has the content keys of each scene's records.
 
     Raises:
         UnirenderError: as `connect`; a worker cannot do it, or several died over a scene.

@@ -105,17 +105,7 @@ def descend(
     every: int,
     first: Sequence[Point] = (),
 ) -> tuple[Curve, Solution]:
-    """Runs a refinement and measures it as it goes.
-
-    Args:
-        name: of the curve.
-        scene: the object.
-        watch: the clock.
-        start: where it begins.
-        config: of the refinement.
-        every: iterations between two measures; the end is measured, too.
-        first: points that were measured before.
-    """
+    """Runs a refinement and measures it every so many iterations, and at its end; `first` was measured before."""
     from unirender_reference.optimize.refine.run import refine
     from unirender_reference.optimize.refine.state import RefineState
 

@@ -50,16 +50,8 @@ class Study:
     ) -> "Study":
         """The study of a suite's first scenes of `objects` objects, as the multi-view table has them.
 
-        Args:
-            suite: a bundled suite, or the path of a suite's TOML file.
-            objects: how many, evenly spaced.
-            seed: of what is compared.
-            own: the module that measures, part of the code's version.
-            settings: cameras and samples.
-            found: versions of the code; None: of what is installed.
-
-        Raises:
-            UnirenderError: no such suite, or its truth was changed.
+        `own` is the module that measures, part of the code's version; `found`: versions of the code, if not those
+        installed.
         """
         loaded = load_suite(suite)
         code = (found or versions()).of(USES) + f"{SEPARATOR}{own} {modules_version(own)}"
