@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from rich.progress import Progress
-from tiny_suites import make_suite
 
 from unirender.camera import Camera
 from unirender.color import srgb_encode, unpremultiply
@@ -47,11 +46,6 @@ from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
 
 NO_MITSUBA = Subsets(mitsuba=0)
 TEST_VERSIONS = Versions("test", {LPIPS: "none", MODEL: "1", REFERENCE: "1"})
-
-
-@pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    return make_suite(tmp_path_factory.mktemp("bench"))
 
 
 class Guess:

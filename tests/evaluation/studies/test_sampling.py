@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 from tiny_models import make_pipeline
-from tiny_suites import make_suite
 
 from unirender.command_line.options import ModelOptions
 from unirender.errors import UnirenderError
@@ -28,6 +27,7 @@ from unirender_evaluation.studies.sampling.measure import DECOMPOSE, MEAN, RENDE
 from unirender_evaluation.studies.sampling.plots import PANELS, draw_reliability
 from unirender_evaluation.studies.sampling.run import run
 from unirender_evaluation.studies.sampling.tables import COLUMNS, calibration_table, headline, quality_table, tables
+from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.versions import MODEL, Versions
 
 VERSIONS = Versions("test", {MODEL: "1"})
@@ -51,9 +51,8 @@ class CountingPipeline:
 
 
 @pytest.fixture(scope="module")
-def what(tmp_path_factory: pytest.TempPathFactory) -> SamplingStudy:
+def what(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> SamplingStudy:
     """Two balls of 32 pixels and an untrained model; nothing is measured yet."""
-    suite = make_suite(tmp_path_factory.mktemp("suite"))
     out = tmp_path_factory.mktemp("sampling")
     return SamplingStudy(suite, out, CountingPipeline(), "none", "cpu", (1, 2), (1, 3), "ddim", 0, VERSIONS)
 

@@ -14,7 +14,6 @@ import torch
 from rich.console import Console
 from synthetic_shards import write_dataset
 from tiny_models import SIZE, TRAIN, make_batch, make_model, make_pipeline
-from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender.training.config import RunConfig, TrainConfig
@@ -51,12 +50,6 @@ from unirender_reference.passes import SAMPLES_PER_PASS, pass_count
 
 CPU = torch.device("cpu")
 PLAIN = dataclasses.replace(TRAIN, model=dataclasses.replace(TRAIN.model, physics_prior="none"))
-
-
-@pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    """Two balls of 32 pixels."""
-    return make_suite(tmp_path_factory.mktemp("suite"))
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import pytest
 from rich.console import Console
 from synthetic_shards import write_dataset
 from tiny_models import SIZE, TRAIN
-from tiny_suites import make_suite
 
 from unirender.errors import UnirenderError
 from unirender.models.config import ModelConfig
@@ -21,6 +20,7 @@ from unirender_evaluation.studies.training.choices import BASE_PRESET, PLAIN, Ch
 from unirender_evaluation.studies.training.command import BenchTraining
 from unirender_evaluation.studies.training.run import TrainingStudy, run
 from unirender_evaluation.studies.training.tables import COLUMNS, cells, table, to_json
+from unirender_evaluation.suites.suite import Suite
 
 ROWS = (
     Choice(PLAIN, "", "Plain model", TRAIN),
@@ -33,9 +33,8 @@ def silent(folder: Path) -> Console:
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> TrainingStudy:
+def study(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> TrainingStudy:
     """Two balls of 32 pixels, groups of the same size, two steps."""
-    suite = make_suite(tmp_path_factory.mktemp("suite"))
     data = write_dataset(tmp_path_factory.mktemp("data"), shards=1, size=SIZE)
     return TrainingStudy(suite, data, tmp_path_factory.mktemp("out"), steps=2, device="cpu", parallel=1)
 

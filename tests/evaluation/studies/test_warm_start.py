@@ -8,7 +8,6 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 from rich.console import Console
-from tiny_suites import make_suite
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
@@ -45,9 +44,8 @@ class Oracle:
 
 
 @pytest.fixture(scope="module")
-def what(tmp_path_factory: pytest.TempPathFactory) -> WarmStart:
+def what(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> WarmStart:
     """Two balls of 32 pixels; nothing is measured yet."""
-    suite = make_suite(tmp_path_factory.mktemp("suite"))
     return WarmStart(suite, tmp_path_factory.mktemp("warm"), Oracle(suite), QUICK, (GEOMETRY,), VERSIONS)
 
 
