@@ -22,7 +22,6 @@ from unirender_evaluation.store import Job
 from unirender_evaluation.suites.suite import Scene, Suite, material_key
 from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import tasks
-from unirender_evaluation.truth.check import TruthCheck
 from unirender_evaluation.versions import LPIPS, REFERENCE
 
 KeyOf = Callable[[str, MethodInfo, Collection[str]], str]  # question, row, parts that it uses -> content key
@@ -134,11 +133,6 @@ def ceiling_jobs(suite: Suite, scene: Scene, key_of: KeyOf, backbones: Sequence[
 
 def _ceiling_record(suite: Suite, task: Task, info: MethodInfo, key: str, backbones: Sequence[str]) -> Record:
     return record_of(task, info, ceiling_values(suite, task, backbones), key)
-
-
-def reference_images(check: TruthCheck) -> dict[str, np.ndarray]:
-    """The re-rendered members by name, as the truth check stores them."""
-    return {c.name: c.mean for c in check.checks}
 
 
 def reference_prediction(

@@ -167,7 +167,8 @@ def _rendered(request: CheckRequest, here: Run, progress: Progress, say: Callabl
 
 def _records(outcome: TruthCheck, info: MethodInfo, here: Run) -> list[tuple[Record, Scene]]:
     """The re-rendered truth as predictions, scored."""
-    images, version, found = bounds.reference_images(outcome), here.versions.of({REFERENCE, LPIPS}), []
+    images = {check.name: check.mean for check in outcome.checks}
+    version, found = here.versions.of({REFERENCE, LPIPS}), []
     for table, protocol in PROTOCOLS:
         for task in tasks(here.suite, table, protocol, list(here.suite.scenes)):
             image, maps = bounds.reference_prediction(task, images, here.suite)
