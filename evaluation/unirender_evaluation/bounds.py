@@ -22,7 +22,6 @@ from unirender_evaluation.store import Job
 from unirender_evaluation.suites.suite import Scene, Suite, material_key
 from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import tasks
-from unirender_evaluation.truth.check import TruthCheck
 from unirender_evaluation.versions import LPIPS, REFERENCE
 
 KeyOf = Callable[[str, MethodInfo, Collection[str]], str]  # question, row, parts that it uses -> content key
@@ -43,12 +42,7 @@ def ceiling_info(suite: Suite) -> MethodInfo:
 
 
 def reference_info(seed: int, scenes: int) -> MethodInfo:
-    """The row of the re-rendered truth.
-
-    Args:
-        seed: of the truth check that rendered it.
-        scenes: how many of the run's scenes it rendered.
-    """
+    """The row of the re-rendered truth."""
     return MethodInfo(
         REFERENCE_KEY,
         "Reference (other seed)",
@@ -81,13 +75,7 @@ def shade_row(scenes: int | None = None) -> Row:
 
 
 def ceiling_values(suite: Suite, task: Task, backbones: Sequence[str] = ()) -> dict[str, float]:
-    """The noise ceiling's values for one task; empty where the truth has no variance (maps).
-
-    Args:
-        suite: the suite.
-        task: the question.
-        backbones: of LPIPS.
-    """
+    """The noise ceiling's values for one task; empty where the truth has no variance (maps)."""
     values: dict[str, float] = {}
     if task.truth_image is not None and task.truth_variance is not None:
         values |= noise_ceiling(task.quantity, task.truth_image, task.truth_variance, task.mask, premultiplied=True)
@@ -145,11 +133,6 @@ def ceiling_jobs(suite: Suite, scene: Scene, key_of: KeyOf, backbones: Sequence[
 
 def _ceiling_record(suite: Suite, task: Task, info: MethodInfo, key: str, backbones: Sequence[str]) -> Record:
     return record_of(task, info, ceiling_values(suite, task, backbones), key)
-
-
-def reference_images(check: TruthCheck) -> dict[str, np.ndarray]:
-    """The re-rendered members by name, as the truth check stores them."""
-    return {c.name: c.mean for c in check.checks}
 
 
 def reference_prediction(

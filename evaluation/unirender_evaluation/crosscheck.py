@@ -44,21 +44,13 @@ OFFICIAL: dict[tuple[Backbone, int], float] = {
 
 @dataclass(frozen=True)
 class Agreement:
-    """One metric against one other implementation.
+    """One metric against one other implementation."""
 
-    Attributes:
-        metric: its label.
-        against: the other implementation, with its version.
-        pairs: how many pairs of pictures.
-        largest: absolute difference, in the metric's unit.
-        tolerance: what it may be.
-    """
-
-    metric: str
-    against: str
-    pairs: int
-    largest: float
-    tolerance: float
+    metric: str  # its label
+    against: str  # the other implementation, with its version
+    pairs: int  # how many pairs of pictures
+    largest: float  # absolute difference, in the metric's unit
+    tolerance: float  # what it may be
 
     @property
     def holds(self) -> bool:

@@ -91,11 +91,6 @@ def decomposition(
     """The maps that a row finds in a picture, and the seconds that they took before this call.
 
     A stranger's method decomposes a picture once, whatever tables want it.
-
-    Args:
-        row: whose.
-        seen: picture, mask and camera.
-        asked: asks the method for them.
     """
     if row.info.kind != "external":
         return asked(), 0.0
@@ -103,11 +98,7 @@ def decomposition(
 
 
 def check_picture(row: Row, task: Task, image: Image | None) -> None:
-    """Refuses a stranger's picture in other units or conventions, whose score would say nothing of it.
-
-    Raises:
-        UnirenderError: see `plausible.picture_doubt`.
-    """
+    """Refuses a stranger's picture in other units or conventions, whose score would say nothing of it."""
     if image is None or (doubt := picture_doubt(image, task.mask)) is None:
         return
     raise UnirenderError(
@@ -183,16 +174,7 @@ def _own(value: Any) -> Any:
 
 
 def _picture(result: Any, size: tuple[int, int], name: str) -> Image:
-    """The picture that a stranger's method returned, as an array of float32.
-
-    Args:
-        result: what it returned.
-        size: (height, width) of the question.
-        name: of method and question, for messages.
-
-    Raises:
-        UnirenderError: it is no array of finite floats of that size.
-    """
+    """The picture that a stranger's method returned, as an array of float32."""
     expected = f"expected finite linear radiance, floats of shape {(*size, 3)}"
     try:
         picture = np.asarray(result)
@@ -261,14 +243,7 @@ def method_jobs(
 ) -> Iterator[Job]:
     """Every question about one scene to every row that answers it; row innermost, so that rows share decompositions.
 
-    Args:
-        suite: the suite.
-        rows: the rows.
-        scenes: of the whole run: rows on a subset choose from them.
-        scene: whose questions are asked.
-        versions: of the code and of what it depends on.
-        backbones: LPIPS backbones.
-        pictures: keeps the predictions of the gallery.
+    `scenes` are those of the whole run: rows on a subset choose from them.
     """
     for table, protocol in PROTOCOLS:
         for task in tasks(suite, table, protocol, [scene]):

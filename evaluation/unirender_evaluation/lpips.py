@@ -29,7 +29,7 @@ BACKBONES: tuple[Backbone, ...] = get_args(Backbone)
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # the ScalingLayer of v0.1, on images in [-1, 1]
 KEPT_TRUTHS = 4  # feature lists kept for reuse; 2 MB each for VGG at 64 px
 KEPT_PIXELS = 2**16  # of a truth whose features are kept
-PIXELS_AT_ONCE = 2**20  # of all pictures of a forward pass, where there are several
+BATCH, PIXELS_AT_ONCE = 32, 2**20  # most pictures of a forward pass, and their pixels where there are several
 EPSILON = 1e-10  # added to the feature norm, as the authors do
 SMALLEST = {"alex": 31, "vgg": 16}  # smallest side (pixels) that leaves at least one value in the last map
 
@@ -104,20 +104,18 @@ class Lpips:
 
     Args:
         backbone: "alex" or "vgg".
-        batch: pairs per forward pass; fewer of pictures that have more than `PIXELS_AT_ONCE` together.
 
     Raises:
         UnirenderError: if the weights are not on this machine.
     """
 
-    def __init__(self, backbone: Backbone = "alex", *, batch: int = 32) -> None:
+    def __init__(self, backbone: Backbone = "alex") -> None:
         path = weights_path(backbone)
         if not path.is_file():
             raise UnirenderError(
                 f"LPIPS-{backbone}: no weights at {path}; run `python -m unirender_evaluation.lpips_convert {backbone}`"
             )
         self.backbone: Backbone = backbone
-        self.batch = batch
         self.network = LpipsNetwork(backbone)
         self.network.load_state_dict(load_file(path))
         self.network.eval().requires_grad_(False)
@@ -173,7 +171,7 @@ class Lpips:
     def _batches(self, images: Float[np.ndarray, "n h w 3"]) -> list[Tensor]:
         tensor = torch.from_numpy(np.ascontiguousarray(images, dtype=np.float32)).permute(0, 3, 1, 2)
         most = max(PIXELS_AT_ONCE // (images.shape[1] * images.shape[2]), 1)
-        return list(tensor.split(min(self.batch, most)))
+        return list(tensor.split(min(BATCH, most)))
 
 
 @lru_cache(maxsize=2)

@@ -95,27 +95,16 @@ def chosen_variants(texts: Iterable[str]) -> tuple[Variant, ...] | None:
 
 @dataclass(frozen=True)
 class Metric:
-    """One kind of number. The direction belongs here and nowhere else.
+    """One kind of number. The direction belongs here and nowhere else."""
 
-    Attributes:
-        name: as in metric keys.
-        label: as in table headers.
-        unit: "" for dimensionless.
-        higher_is_better: direction.
-        perfect: value of a perfect prediction.
-        axes: the axes of `Variant` that the metric has, in the order mask, space, scale.
-        decimals: digits after the point in tables; ranks are taken on rounded values.
-        formula: one line for the protocol.
-    """
-
-    name: str
-    label: str
-    unit: str
+    name: str  # as in metric keys
+    label: str  # as in table headers
+    unit: str  # "" for dimensionless
     higher_is_better: bool
-    perfect: float
-    axes: tuple[str, ...] = ()
-    decimals: int = 4
-    formula: str = ""
+    perfect: float  # value of a perfect prediction
+    axes: tuple[str, ...] = ()  # the axes of `Variant` that the metric has, in the order mask, space, scale
+    decimals: int = 4  # digits after the point in tables; ranks are taken on rounded values
+    formula: str = ""  # one line for the protocol
 
     def better(self, a: float, b: float) -> bool:
         """Whether a is strictly better than b."""

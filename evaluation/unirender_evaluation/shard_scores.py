@@ -40,19 +40,12 @@ RENDERS = {  # of pictures rendered from the true maps; closed form: what our ne
 
 @dataclass(frozen=True)
 class Scored:
-    """One picture's scores.
+    """One picture's scores."""
 
-    Attributes:
-        folder: it is from.
-        group: its key there; an object may have several.
-        metallic: of the object; None: it has a map.
-        scores: by metric.
-    """
-
-    folder: str
-    group: str
-    metallic: float | None
-    scores: dict[str, float]
+    folder: str  # it is from
+    group: str  # its key there; an object may have several
+    metallic: float | None  # of the object; None: it has a map
+    scores: dict[str, float]  # by metric
 
     @property
     def object(self) -> str:
@@ -119,11 +112,6 @@ def minus(found: Sequence[Scored], base: Sequence[Scored]) -> list[Scored]:
 def shard_tables(found: Sequence[Scored], what: str, titled: str = "") -> list[TextTable]:
     """Means by folder and, below each, by metallic, ± half of their intervals over objects: of maps and, where there
     are any, of renderings.
-
-    Args:
-        found: at least one.
-        what: was scored, and how, for the notes.
-        titled: ends the titles.
     """
     read = f"{what} Masked, sRGB, raw; ± half of the {INTERVAL}."
     maps = f"{read} Pictures are seen at 8 bits. Roughness and metallic: mean over the object against its number."

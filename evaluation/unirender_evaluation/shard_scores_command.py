@@ -40,11 +40,7 @@ class BenchShards:
     """Where the model runs. auto: cuda, then mps, then cpu, whichever is there."""
 
     def check(self) -> None:
-        """Looks at the values.
-
-        Raises:
-            UsageError: one is outside its range, or a folder is named twice, or none.
-        """
+        """Looks at the values; `UsageError` where one is outside its range, or a folder is named twice, or none."""
         at_least(1, objects=self.objects, pairs=self.pairs)
         at_least(0, seed=self.seed)
         if not self.data or len(set(self.data)) < len(self.data):

@@ -138,21 +138,13 @@ def _kept(file: Path, mend: bool) -> Iterator[Record]:
 
 @dataclass(frozen=True)
 class Job:
-    """One record that a run wants.
+    """One record that a run wants."""
 
-    Attributes:
-        key: its content key.
-        label: for the progress bar.
-        make: computes it.
-        kept: whether the picture that belongs to it is there (or none is wanted).
-        possible: whether what it needs is here; where it is not, a record that is stored counts, and none is made.
-    """
-
-    key: str
-    label: str
-    make: Callable[[], Record]
-    kept: bool = True
-    possible: bool = True
+    key: str  # its content key
+    label: str  # for the progress bar
+    make: Callable[[], Record]  # computes it
+    kept: bool = True  # whether the picture that belongs to it is there (or none is wanted)
+    possible: bool = True  # whether what it needs is here; else a record that is stored counts, and none is made
 
     def is_done(self, has: Callable[[str], bool]) -> bool:
         """Whether nothing is to do; `has` says whether a record is there."""

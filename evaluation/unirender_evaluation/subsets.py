@@ -5,25 +5,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Subsets:
-    """Scenes of each slow part of a run, evenly spaced; None = all of the run's.
+    """Scenes of each slow part of a run, evenly spaced; None = all of the run's."""
 
-    Attributes:
-        sample: of the sampling rows, which cost steps x samples; 0 = leave them out.
-        shade: of `shade(true maps)`, which renders with Mitsuba.
-        physics: of the physics table: renderer tests and closed loops.
-        optimise: of the rows that optimise each picture.
-        pictures: pictures of each such scene in the inverse table.
-        views: objects of the multi-view table; 0 = leave it out.
-        mitsuba: of the row *Mitsuba*, which renders as many samples as the truth has; 0 = leave it out.
-    """
-
-    sample: int | None = 4
-    shade: int | None = 12
-    physics: int | None = 12
-    optimise: int | None = 4
-    pictures: int | None = 2
-    views: int | None = 4
-    mitsuba: int | None = 4
+    sample: int | None = 4  # of the sampling rows, which cost steps x samples; 0 = leave them out
+    shade: int | None = 12  # of `shade(true maps)`, which renders with Mitsuba
+    physics: int | None = 12  # of the physics table: renderer tests and closed loops
+    optimise: int | None = 4  # of the rows that optimise each picture
+    pictures: int | None = 2  # pictures of each such scene in the inverse table
+    views: int | None = 4  # objects of the multi-view table; 0 = leave it out
+    mitsuba: int | None = 4  # of the row *Mitsuba*, which renders as many samples as the truth has; 0 = leave it out
 
 
 STANDARD = Subsets()

@@ -49,6 +49,15 @@ def picture(suite: Suite, scene: Scene, material: MetallicRoughness) -> dict[str
     }
 
 
+def _picture_truth(suite: Suite, scene: Scene, material: MetallicRoughness) -> dict[str, Any]:
+    """What the scorer keeps of a picture."""
+    return {
+        "truth_image": suite.image(scene, material),
+        "truth_variance": suite.image_variance(scene, material),
+        "truth_twin": suite.ceiling_image(scene, material),
+    }
+
+
 def scene_ids(suite: Suite, limit: int | None) -> list[Scene]:
     """The scenes of a run; a limited run takes them evenly spaced.
 
@@ -110,9 +119,7 @@ def _read_edit(suite: Suite, scene: Scene, target: MetallicRoughness) -> Asked:
     return Asked(
         suite.mask(scene),
         {"edit": {**picture(suite, scene, base), **change}},
-        truth_image=suite.image(scene, target),
-        truth_variance=suite.image_variance(scene, target),
-        truth_twin=suite.ceiling_image(scene, target),
+        **_picture_truth(suite, scene, target),
     )
 
 
@@ -138,9 +145,7 @@ def _read_render(suite: Suite, scene: Scene, target: MetallicRoughness, protocol
     return Asked(
         suite.mask(scene),
         {"render": {"intrinsics": maps}},
-        truth_image=suite.image(scene, target),
-        truth_variance=suite.image_variance(scene, target),
-        truth_twin=suite.ceiling_image(scene, target),
+        **_picture_truth(suite, scene, target),
     )
 
 
@@ -201,9 +206,7 @@ def _read_relight(suite: Suite, scene: Scene, target: Scene, given_sd: bool) -> 
     return Asked(
         suite.mask(scene),
         {"relight": {**seen, **light}, "decompose": seen},
-        truth_image=suite.image(target, base),
-        truth_variance=suite.image_variance(target, base),
-        truth_twin=suite.ceiling_image(target, base),
+        **_picture_truth(suite, target, base),
         truth_maps=own_light,
     )
 

@@ -79,19 +79,11 @@ def write_statistics(folder: Path, path: Path) -> str:
     lines = [f"{name} = [{', '.join(f'{x:.4f}' for x in value)}]" for name, value in numbers.items()]
     provenance = (
         f"mean over {len(means)} training groups (split {config['split']}, seed {config['seed']}, "
-        f"{config['resolution']} px) "
-        "of each group's coverage-weighted mean; albedo as sRGB display values; the normal's mean, normalised"
+        f"{config['resolution']} px) of each group's coverage-weighted mean; albedo as sRGB display values; "
+        "the normal's mean, normalised"
     )
-    text = (
-        "\n".join(
-            [
-                "# Written by `python -m unirender_evaluation.training_statistics DATA`.",
-                *lines,
-                f'provenance = "{provenance}"',
-            ]
-        )
-        + "\n"
-    )
+    head = "# Written by `python -m unirender_evaluation.training_statistics DATA`."
+    text = "\n".join([head, *lines, f'provenance = "{provenance}"']) + "\n"
     replace_file(path, text)
     return text
 

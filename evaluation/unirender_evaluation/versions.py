@@ -30,19 +30,12 @@ SEPARATOR = "/"  # between the core's version and those of the other parts
 
 @dataclass(frozen=True)
 class Part:
-    """What makes up a part.
+    """What makes up a part."""
 
-    Attributes:
-        files: package -> patterns below its folder.
-        libraries: distributions.
-        without: `package/path` (patterns) of files that results do not depend on.
-        variables: of the environment.
-    """
-
-    files: Mapping[str, tuple[str, ...]]
-    libraries: tuple[str, ...]
-    without: tuple[str, ...] = ()
-    variables: tuple[str, ...] = ()
+    files: Mapping[str, tuple[str, ...]]  # package -> patterns below its folder
+    libraries: tuple[str, ...]  # distributions
+    without: tuple[str, ...] = ()  # `package/path` (patterns) of files that results do not depend on
+    variables: tuple[str, ...] = ()  # of the environment
 
 
 LIGHT_READER = ("lights/files.py", "lights/light.py")  # of lights in folders of predictions

@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from rich.progress import Progress
-from tiny_suites import make_suite
 
 from unirender.camera import Camera
 from unirender.color import srgb_encode, unpremultiply
@@ -47,11 +46,6 @@ from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
 
 NO_MITSUBA = Subsets(mitsuba=0)
 TEST_VERSIONS = Versions("test", {LPIPS: "none", MODEL: "1", REFERENCE: "1"})
-
-
-@pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    return make_suite(tmp_path_factory.mktemp("bench"))
 
 
 class Guess:
@@ -135,53 +129,17 @@ def under_one_light(suite: Suite) -> list[Scene]:
     return [scene for scene in suite.scenes if scene.key.endswith("_l0")]
 
 
-def evaluate(
-    suite: Suite, rows: list[Row], path: Path, scenes: Sequence[Scene] = (), stop_after: int | None = None
-) -> list[Record]:
-    """The engine on these scenes (none: all) without Mitsuba and LPIPS; after `stop_after` records it is killed."""
+def evaluate(suite: Suite, rows: list[Row], path: Path, scenes: Sequence[Scene] = ()) -> list[Record]:
+    """The engine on these scenes (none: all) without Mitsuba and LPIPS."""
     store = Store.open(path)
     pictures = path.parent / "pictures" / path.stem
     scenes = scenes or suite.scenes
     whole = Run(suite, rows, list(scenes), TEST_VERSIONS, (), pictures, NO_MITSUBA)
-    done = 0
     for scene in scenes:
         for job in whole.jobs(scene):
-            if job.label.startswith("physics") or job.is_done(store.has):
-                continue
-            store.add(job.make())
-            done += 1
-            if done == stop_after:
-                raise KeyboardInterrupt
+            if not job.label.startswith("physics") and not job.is_done(store.has):
+                store.add(job.make())
     return store.close()
-
-
-@pytest.mark.long
-def test_killed_run_resumes_to_the_same_records(suite: Suite, tmp_path: Path) -> None:
-    rows = trivial_rows()
-    whole = evaluate(suite, rows, tmp_path / "whole.jsonl")
-    path = tmp_path / "killed.jsonl"
-    with pytest.raises(KeyboardInterrupt):
-        evaluate(suite, rows, path, stop_after=20)
-    with path.open("a") as stream:
-        stream.write('{"table": "inv')  # torn by the kill
-    asked = []
-    original = engine.answer
-
-    def counting(row: Row, task: Any) -> Any:
-        asked.append(task.identity)
-        return original(row, task)
-
-    engine.answer = counting
-    try:
-        resumed = evaluate(suite, rows, path)
-        first = len(asked)
-        again = evaluate(suite, rows, path)
-    finally:
-        engine.answer = original
-    strip = lambda records: [(r.table, r.protocol, r.method, r.sample, r.values, r.key) for r in records]  # noqa: E731 - one use
-    assert strip(resumed) == strip(whole) == strip(again) == strip(read_records(path))
-    assert first == sum(r.method not in ("noise-ceiling", "true-light-16-x-32") for r in whole) - 20
-    assert len(asked) == first, "a third run asks nothing"
 
 
 class Watched(Run):
@@ -265,16 +223,6 @@ def test_keys_change_with_what_results_depend_on(suite: Suite) -> None:
     }
     assert len({base, *others}) == 5
     assert base == content_key(suite, scene, "inverse/x", {"a": 1}, "code")
-
-
-@pytest.mark.long
-def test_stale_records_are_dropped(suite: Suite, tmp_path: Path) -> None:
-    path = tmp_path / "records.jsonl"
-    many = evaluate(suite, trivial_rows(), path)
-    few = evaluate(suite, [make_row(UneditedInput(), "trivial")], path)
-    assert {r.method for r in few} == {"unedited-input", "noise-ceiling", "true-light-16-x-32"}
-    assert len(few) < len(many)
-    assert len(read_records(path)) == len(few)
 
 
 @pytest.mark.long

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_suites import make_suite
 
 from unirender.camera import Camera
 from unirender.color import srgb_decode
@@ -33,11 +32,6 @@ from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import tasks
 from unirender_evaluation.training_statistics import training_statistics
 from unirender_evaluation.versions import LPIPS, Versions
-
-
-@pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    return make_suite(tmp_path_factory.mktemp("methods"))
 
 
 def test_constant_half_scores_the_spread_of_the_materials(suite: Suite) -> None:

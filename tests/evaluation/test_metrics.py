@@ -99,16 +99,6 @@ def test_large_pictures_have_the_same_values_in_less_memory(monkeypatch: pytest.
     assert metrics.ciede2000(p[0], t[0], p[1, ..., :1]) == expected
 
 
-def test_weighted_error_ignores_what_the_mask_leaves_out_and_nothing_else() -> None:
-    p, t = images(3)
-    w = disc()
-    outside, inside = p.copy(), p.copy()
-    outside[w[..., 0] == 0] = 1.0
-    inside[20, 16] += 0.1
-    assert metrics.mse(outside, t, w) == metrics.mse(p, t, w)
-    assert metrics.mse(inside, t, w) != metrics.mse(p, t, w)
-
-
 def test_weighted_error_by_hand() -> None:
     p = np.array([[[0.5], [0.2]]], np.float32)
     t = np.zeros((1, 2, 1), np.float32)
@@ -165,13 +155,6 @@ def test_alignment_per_channel_finds_a_tint_and_per_image_does_not() -> None:
     tinted = t * np.array([0.5, 1.0, 2.0], np.float32)
     np.testing.assert_allclose(metrics.align_scale(tinted, t, disc(), "aligned_rgb"), t, rtol=1e-4)
     assert metrics.mse(metrics.align_scale(tinted, t, disc(), "aligned"), t, disc()) > 1e-3
-
-
-def test_alignment_never_worsens_the_linear_error() -> None:
-    for seed in range(5):
-        p, t = images(seed, distance=0.8)
-        errors = [metrics.mse(metrics.align_scale(p, t, disc(), scale), t, disc()) for scale in metrics.SCALES]
-        assert errors[0] >= errors[1] >= errors[2]
 
 
 def test_alignment_leaves_black_alone() -> None:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 from reference_scenes import environment, sphere
-from tiny_suites import make_suite
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
@@ -146,11 +145,6 @@ class Witness:
     def decompose(self, **inputs: Any) -> Intrinsics:
         self.handed.append(inputs)
         return Intrinsics(albedo=inputs["image_srgb"])
-
-
-@pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    return make_suite(tmp_path_factory.mktemp("optimized"))
 
 
 def test_the_mesh_is_told_to_rows_that_declare_it(suite: Suite) -> None:

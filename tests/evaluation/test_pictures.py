@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_suites import make_suite
 
 from unirender.intrinsics import Intrinsics
 from unirender.light.environment import environment_directions
@@ -16,11 +15,6 @@ from unirender_evaluation.report.samples import make_sheets
 from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import tasks
-
-
-@pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    return make_suite(tmp_path_factory.mktemp("pictures"))
 
 
 def first_task(suite: Suite, table: str, protocol: str) -> Task:

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 from rich.progress import Progress
-from tiny_suites import make_suite
 
 import unirender_reference.render
 from unirender.intrinsics import Intrinsics
@@ -34,11 +33,6 @@ from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
 from unirender_reference.passes import Estimate
 
 VERSIONS = Versions("test", {LPIPS: "none", MODEL: "1", REFERENCE: "1"})
-
-
-@pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    return make_suite(tmp_path_factory.mktemp("run_check"))
 
 
 class Folder:

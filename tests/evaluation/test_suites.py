@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_suites import make_suite, write_suite
+from tiny_suites import write_suite
 
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
@@ -15,11 +15,6 @@ from unirender_evaluation.suites.stratification import stratified_materials
 from unirender_evaluation.suites.suite import Suite, load_suite, material_key
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import scene_ids, tasks
-
-
-@pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    return make_suite(tmp_path_factory.mktemp("suites"))
 
 
 def test_tiny_materials_are_stratified_and_independent() -> None:

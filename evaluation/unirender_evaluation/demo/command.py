@@ -36,11 +36,7 @@ class Demo:
     """Time that a single request may take; it is stopped then."""
 
     def check(self) -> None:
-        """Looks at the values.
-
-        Raises:
-            UsageError: one is outside its range.
-        """
+        """Looks at the values; `UsageError` where one is outside its range."""
         at_least(1, port=self.port, max_pixels=self.max_pixels)
         if self.port > MOST_PORT:
             raise UsageError(f"--port {self.port}: expected at most {MOST_PORT}")

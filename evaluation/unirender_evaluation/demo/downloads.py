@@ -17,12 +17,7 @@ SHARED = {"base_color.png", "meta.json"}
 
 
 def archives(seen: View, meta: Mapping[str, Any]) -> dict[str, bytes]:
-    """`maps.zip` (EXR and PNG), `gltf.zip` and `mitsuba.zip` of what is seen; nothing stays on the disk.
-
-    Args:
-        seen: picture, maps and light as set.
-        meta: facts on where they come from, for `meta.json`.
-    """
+    """`maps.zip` (EXR and PNG), `gltf.zip` and `mitsuba.zip` of what is seen; nothing stays on the disk."""
     with tempfile.TemporaryDirectory(prefix="unirender-demo-") as folder:
         maps, scene = Path(folder) / "maps", Path(folder) / "scene"
         for part in (maps, scene):

@@ -26,61 +26,37 @@ ARCHIVES = {
 
 @dataclass(frozen=True)
 class Context:
-    """What all jobs share.
+    """What all jobs share."""
 
-    Attributes:
-        pipeline: the model.
-        limits: of uploads.
-        meta: which model it is, for downloads.
-    """
-
-    pipeline: UniRenderPipeline
-    limits: Limits
-    meta: Mapping[str, Any] = field(default_factory=dict)
+    pipeline: UniRenderPipeline  # the model
+    limits: Limits  # of uploads
+    meta: Mapping[str, Any] = field(default_factory=dict)  # which model it is, for downloads
 
 
 @dataclass(frozen=True)
 class Opened:
-    """A picture that was taken apart.
+    """A picture that was taken apart."""
 
-    Attributes:
-        subject: to be remembered.
-        view: HTML of picture, result and light.
-        maps: HTML of the maps.
-    """
-
-    subject: Subject
-    view: str
-    maps: str
+    subject: Subject  # to be remembered
+    view: str  # HTML of picture, result and light
+    maps: str  # HTML of the maps
 
 
 def start(checkpoint: Path | None, device: Device, limits: Limits) -> Context:
-    """Loads the model.
-
-    Raises:
-        UnirenderError: no such checkpoint.
-    """
+    """Loads the model."""
     options = ModelOptions(checkpoint, device, progress=False)
     pipeline = options.load()
     return Context(pipeline, limits, options.provenance(pipeline))
 
 
 def open_upload(context: Context, picture: Upload, mask: Upload | None, side: int) -> Opened:
-    """Takes a visitor's picture apart.
-
-    Raises:
-        UnirenderError: a file cannot be used.
-    """
+    """Takes a visitor's picture apart."""
     found, remarks = read_upload(picture, mask, context.limits)
     return open_picture(context, found, side, remarks)
 
 
 def open_picture(context: Context, picture: Picture, side: int, remarks: tuple[str, ...] = ()) -> Opened:
-    """Takes a picture with a mask apart.
-
-    Raises:
-        UnirenderError: it cannot be used.
-    """
+    """Takes a picture with a mask apart."""
     subject = session.take_apart(context.pipeline, square(picture, side))
     seen = session.view(context.pipeline, subject, Controls())
     noted = session.View(seen.image_linear, seen.rendered, seen.intrinsics, remarks)
@@ -88,11 +64,7 @@ def open_picture(context: Context, picture: Picture, side: int, remarks: tuple[s
 
 
 def open_light(context: Context, light: Upload) -> Environment:
-    """Reads a visitor's light.
-
-    Raises:
-        UnirenderError: the file cannot be used.
-    """
+    """Reads a visitor's light."""
     return read_light(light, context.limits)
 
 

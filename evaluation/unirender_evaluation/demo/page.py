@@ -31,29 +31,16 @@ Handler = Callable[..., Any]
 
 @dataclass(frozen=True)
 class Session:
-    """What is remembered of a visitor.
+    """What is remembered of a visitor."""
 
-    Attributes:
-        picture: the upload, or an example.
-        mask: the uploaded mask.
-        subject: the picture taken apart.
-        light: the uploaded light.
-    """
-
-    picture: Upload | Picture | None = None
-    mask: Upload | None = None
-    subject: Subject | None = None
-    light: Environment | None = None
+    picture: Upload | Picture | None = None  # the upload, or an example
+    mask: Upload | None = None  # the uploaded mask
+    subject: Subject | None = None  # the picture taken apart
+    light: Environment | None = None  # the uploaded light
 
 
 class Page:
-    """The handlers of the page's events.
-
-    Args:
-        worker: does the work.
-        limits: that the page names.
-        examples: pictures with masks, by their names.
-    """
+    """The handlers of the page's events."""
 
     def __init__(self, worker: Worker, limits: Limits, examples: Mapping[str, Picture]) -> None:
         self.worker, self.limits, self.examples = worker, limits, examples
@@ -175,11 +162,7 @@ def refusing(handler: Handler) -> Handler:
 
 
 def opened_subject(session: Session) -> Subject:
-    """The picture that is open.
-
-    Raises:
-        UnirenderError: there is none.
-    """
+    """The picture that is open."""
     if session.subject is None:
         raise UnirenderError(NOTHING)
     return session.subject
@@ -188,11 +171,7 @@ def opened_subject(session: Session) -> Subject:
 def read_controls(
     session: Session, metallic: float, roughness: float, light: str, turn_deg: float, anchored: bool
 ) -> Controls:
-    """What the controls say; a slider at the predicted value changes nothing.
-
-    Raises:
-        UnirenderError: an own light is chosen, and there is none.
-    """
+    """What the controls say; a slider at the predicted value changes nothing."""
     found = opened_subject(session).decomposition
     if light == OWN and session.light is None:
         raise UnirenderError("Drop in a light of your own first.")

@@ -46,15 +46,7 @@ Mask = Float[np.ndarray, "h w 1"]
 
 
 def figure(name: str, picture: Picture, mask: Mask | None = None, note: str = "", kind: str = "") -> str:
-    """A picture with its name and a note below; what lies outside the mask is transparent.
-
-    Args:
-        name: of the picture.
-        picture: display values.
-        mask: coverage.
-        note: in small letters.
-        kind: class of the figure.
-    """
+    """A picture with its name and a note below; what lies outside the mask is transparent."""
     small = f"<small>{html.escape(note)}</small>" if note else ""
     height, width = picture.shape[:2]
     return (

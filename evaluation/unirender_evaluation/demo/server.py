@@ -40,11 +40,7 @@ EXAMPLES = {"gear": "test-000020_l1", "knot": "test-000012_l0", "ball": "test-00
 
 
 def serve(worker: Worker, limits: Limits, host: str, port: int) -> None:
-    """Serves the page until it is interrupted.
-
-    Raises:
-        UnirenderError: the address is not to be had.
-    """
+    """Serves the page until it is interrupted."""
     with served(worker, limits, host, port) as address:
         print(f"unirender demo: {address} (Ctrl-C ends it)", flush=True)
         threading.Event().wait()
@@ -52,11 +48,7 @@ def serve(worker: Worker, limits: Limits, host: str, port: int) -> None:
 
 @contextmanager
 def served(worker: Worker, limits: Limits, host: str, port: int) -> Iterator[str]:
-    """The page's address while the block runs; what visitors uploaded is deleted when it ends.
-
-    Raises:
-        UnirenderError: the address is not to be had.
-    """
+    """The page's address while the block runs; what visitors uploaded is deleted when it ends."""
     with tempfile.TemporaryDirectory(prefix="unirender-demo-") as folder:
         os.environ.update(QUIET | {"GRADIO_TEMP_DIR": folder})
         from gradio.themes import Default
@@ -112,11 +104,7 @@ def cleaned(page: str) -> str:
 
 
 class NothingElsewhere:
-    """ASGI middleware: `HEADERS` on every answer, and HTML without elements that name another host.
-
-    Args:
-        app: that answers.
-    """
+    """ASGI middleware: `HEADERS` on every answer, and HTML without elements that name another host."""
 
     def __init__(self, app: Callable[..., Awaitable[None]]) -> None:
         self.app = app

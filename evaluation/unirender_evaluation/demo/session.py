@@ -39,17 +39,11 @@ Environment = Float[np.ndarray, "eh ew 3"]
 
 @dataclass(frozen=True)
 class Subject:
-    """A picture that was taken apart.
+    """A picture that was taken apart."""
 
-    Attributes:
-        picture: with a mask.
-        decomposition: of it, mode `mean`.
-        rendered: R_0, premultiplied linear.
-    """
-
-    picture: Picture
-    decomposition: Decomposition
-    rendered: Float[np.ndarray, "h w 3"]
+    picture: Picture  # with a mask
+    decomposition: Decomposition  # of it, mode `mean`
+    rendered: Float[np.ndarray, "h w 3"]  # R_0, premultiplied linear
 
     @property
     def maps(self) -> Intrinsics:
@@ -68,71 +62,39 @@ class Subject:
 
 @dataclass(frozen=True)
 class Controls:
-    """What a visitor has set.
+    """What a visitor has set."""
 
-    Attributes:
-        metallic: of the whole object, [0, 1]; None: as predicted.
-        roughness: the same.
-        light: lat-long radiance in camera axes, any scale; None: the one that was found, which agrees with s and d.
-        turn_deg: by which the light is turned about +y, from +z towards +x.
-        anchored: whether the change is applied to the picture; else the plain render is shown.
-    """
-
-    metallic: float | None = None
-    roughness: float | None = None
-    light: Environment | None = None
-    turn_deg: float = 0.0
-    anchored: bool = True
+    metallic: float | None = None  # of the whole object, [0, 1]; None: as predicted
+    roughness: float | None = None  # the same
+    light: Environment | None = None  # lat-long, camera axes, any scale; None: the one found, which agrees with s and d
+    turn_deg: float = 0.0  # by which the light is turned about +y, from +z towards +x
+    anchored: bool = True  # whether the change is applied to the picture; else the plain render is shown
 
 
 @dataclass(frozen=True)
 class View:
-    """What is seen under some controls.
+    """What is seen under some controls."""
 
-    Attributes:
-        image_linear: premultiplied, linear, >= 0.
-        rendered: R_1, the plain render.
-        intrinsics: the maps and the light as set.
-        remarks: what the picture does not show, and why.
-    """
-
-    image_linear: Float[np.ndarray, "h w 3"]
-    rendered: Float[np.ndarray, "h w 3"]
-    intrinsics: Intrinsics
-    remarks: tuple[str, ...] = ()
+    image_linear: Float[np.ndarray, "h w 3"]  # premultiplied, linear, >= 0
+    rendered: Float[np.ndarray, "h w 3"]  # R_1, the plain render
+    intrinsics: Intrinsics  # the maps and the light as set
+    remarks: tuple[str, ...] = ()  # what the picture does not show, and why
 
 
 @dataclass(frozen=True)
 class Check:
-    """The same maps under the same light, by the model and by Mitsuba.
+    """The same maps under the same light, by the model and by Mitsuba."""
 
-    Attributes:
-        model: premultiplied linear.
-        mitsuba: the same.
-        flip: FLIP error in colours.
-        flip_mean: over the object.
-        psnr_db: inside the mask, sRGB.
-        seconds: that Mitsuba took, compilation included.
-    """
-
-    model: Float[np.ndarray, "h w 3"]
-    mitsuba: Float[np.ndarray, "h w 3"]
-    flip: Float[np.ndarray, "h w 3"]
-    flip_mean: float
-    psnr_db: float
-    seconds: float
+    model: Float[np.ndarray, "h w 3"]  # premultiplied linear
+    mitsuba: Float[np.ndarray, "h w 3"]  # the same
+    flip: Float[np.ndarray, "h w 3"]  # FLIP error in colours
+    flip_mean: float  # over the object
+    psnr_db: float  # inside the mask, sRGB
+    seconds: float  # that Mitsuba took, compilation included
 
 
 def take_apart(pipeline: UniRenderPipeline, picture: Picture) -> Subject:
-    """Inverse rendering, and the rendering of what was found.
-
-    Args:
-        pipeline: the model.
-        picture: with a mask.
-
-    Raises:
-        UnirenderError: the picture or its mask is not usable.
-    """
+    """Inverse rendering, and the rendering of what was found."""
     decomposition = pipeline.decompose(picture.image_srgb, picture.mask)
     return Subject(picture, decomposition, render(pipeline, decomposition.with_network_light))
 
@@ -142,9 +104,6 @@ def view(pipeline: UniRenderPipeline, subject: Subject, controls: Controls) -> V
 
     Under the predicted light as it stands, s follows the new roughness as in `UniRenderPipeline.edit`; under any other
     s and d are derived from the normals, as in `UniRenderPipeline.relight`.
-
-    Raises:
-        UnirenderError: a number is outside its range, or the light is not usable.
     """
     before = subject.decomposition.with_network_light
     edited, remarks, derived = before, [], ()
@@ -191,11 +150,7 @@ def turned(environment: Environment, turn_deg: float) -> Environment:
 
 
 def check(seen: View, spp: int = SPP) -> Check:
-    """Mitsuba shades the maps that the model rendered, under the light that is shown with them.
-
-    Raises:
-        UnirenderError: Mitsuba cannot run here, or the light is not usable.
-    """
+    """Mitsuba shades the maps that the model rendered, under the light that is shown with them."""
     mask = seen.intrinsics.require("mask")["mask"]
     start = time.perf_counter()
     truth = shade(seen.intrinsics, spp=spp)

@@ -36,38 +36,23 @@ HEAD = 4096  # bytes in which the sizes of .hdr and .pfm files stand
 
 @dataclass(frozen=True)
 class Limits:
-    """What is taken, and for how long a request may run.
+    """What is taken, and for how long a request may run."""
 
-    Attributes:
-        megabytes: size of a file, in millions of bytes.
-        pixels: width times height.
-        seconds: of a single request.
-    """
-
-    megabytes: float
-    pixels: int
-    seconds: float
+    megabytes: float  # size of a file, in millions of bytes
+    pixels: int  # width times height
+    seconds: float  # of a single request
 
 
 @dataclass(frozen=True)
 class Upload:
-    """A file in memory.
+    """A file in memory."""
 
-    Attributes:
-        name: as its owner calls it, without folders.
-        data: its bytes.
-    """
-
-    name: str
+    name: str  # as its owner calls it, without folders
     data: bytes
 
     @classmethod
     def take(cls, path: str | Path) -> "Upload":
-        """Reads a file and deletes it.
-
-        Raises:
-            UnirenderError: it is not there.
-        """
+        """Reads a file and deletes it."""
         path = Path(path)
         try:
             data = path.read_bytes()
@@ -78,12 +63,8 @@ class Upload:
 
 
 def read_upload(picture: Upload, mask: Upload | None, limits: Limits) -> tuple[Picture, tuple[str, ...]]:
-    """A picture with a mask, and remarks on what was assumed and what the picture cannot show.
-
-    Args:
-        picture: PNG, JPG or EXR.
-        mask: picture of the coverage; None: the alpha channel, else the whole frame.
-        limits: of both files.
+    """A picture with a mask (None: its alpha channel, else the whole frame), and remarks on what was assumed and what
+    it cannot show.
 
     Raises:
         UnirenderError: a file is too large, or no readable picture; or the mask does not fit or is empty.
@@ -96,11 +77,7 @@ def read_upload(picture: Upload, mask: Upload | None, limits: Limits) -> tuple[P
 
 
 def square(picture: Picture, side: int) -> Picture:
-    """The object in the middle of a square of `side` pixels.
-
-    Raises:
-        UnirenderError: another side than one of `SIDES`.
-    """
+    """The object in the middle of a square of `side` pixels."""
     if side not in SIDES:
         raise UnirenderError(f"resolution: got {side}, expected one of {', '.join(map(str, SIDES))} pixels")
     return framed(picture, side)
@@ -121,11 +98,7 @@ def read_light(light: Upload, limits: Limits) -> Float[np.ndarray, "eh ew 3"]:
 
 @contextlib.contextmanager
 def _as_file(upload: Upload, limits: Limits) -> Iterator[Path]:
-    """The upload as a file of its name, for readers; its errors name no folder.
-
-    Raises:
-        UnirenderError: it has more bytes or pixels than the limits allow.
-    """
+    """The upload as a file of its name, for readers; its errors name no folder."""
     check_size(upload, limits)
     with tempfile.TemporaryDirectory(prefix="unirender-demo-") as folder:
         path = Path(folder) / upload.name
@@ -137,11 +110,7 @@ def _as_file(upload: Upload, limits: Limits) -> Iterator[Path]:
 
 
 def check_size(upload: Upload, limits: Limits) -> None:
-    """Looks at the size of a file and of the picture in it, without decoding it.
-
-    Raises:
-        UnirenderError: it is above the limits.
-    """
+    """Looks at the size of a file and of the picture in it, without decoding it."""
     if len(upload.data) > limits.megabytes * 1e6:
         raise UnirenderError(
             f"{upload.name}: {len(upload.data) / 1e6:.1f} MB, expected at most {limits.megabytes:g} MB; scale it down "

@@ -45,11 +45,7 @@ class Worker:
         self._folder: tempfile.TemporaryDirectory[str] | None = None
 
     def __enter__(self) -> "Worker":
-        """Waits until the process can work.
-
-        Raises:
-            UnirenderError: `start` did.
-        """
+        """Waits until the process can work."""
         try:
             with self._lock:
                 self._begin()

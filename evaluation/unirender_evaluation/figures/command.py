@@ -68,11 +68,7 @@ class Figures:
     """Where our model runs. auto: cuda, then mps, then cpu, whichever is there."""
 
     def check(self) -> None:
-        """Looks at the values.
-
-        Raises:
-            UsageError: one is outside its range, or named twice.
-        """
+        """Looks at the values; `UsageError` where one is outside its range, or named twice."""
         at_least(1, lights=self.lights, spp=self.spp)
         for name in ("scenes", "pictures", "kinds", "values", "checkpoint", "method"):
             given = getattr(self, name)
@@ -88,11 +84,7 @@ class Figures:
             self.check_pictures()
 
     def check_pictures(self) -> None:
-        """Looks at what stands beside --pictures.
-
-        Raises:
-            UsageError: it is not about pictures of one's own.
-        """
+        """Looks at what stands beside --pictures."""
         strips, fields = self.strips(), type(self).__dataclass_fields__
         if self.kinds != KINDS and set(strips) != set(self.kinds):
             raise UsageError(

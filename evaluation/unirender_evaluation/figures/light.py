@@ -18,11 +18,7 @@ AROUND = 0.15  # display value behind the balls, on which bright and dark ones s
 
 
 def light_figure(subjects: Sequence[Subject], suite: Suite, scenes: Sequence[Scene]) -> Grid:
-    """What every subject's light makes of three balls, a row each, the truth below; with the aligned errors.
-
-    Raises:
-        UnirenderError: a subject finds no light.
-    """
+    """What every subject's light makes of three balls, a row each, the truth below; with the aligned errors."""
     taking_part, lines = able(subjects, "decompose", "light"), []
     for scene in scenes:
         seen, true = picture(suite, scene, suite.spec.base), suite.environment(scene)

@@ -52,23 +52,14 @@ class Subject:
 
 
 class MitsubaTruth:
-    """Renders a suite's object under any material and light.
-
-    Args:
-        suite: names the objects.
-        spp: samples per pixel, rounded up to whole passes.
-    """
+    """Renders a suite's object under any material and light, with samples rounded up to whole passes."""
 
     def __init__(self, suite: Suite, spp: int) -> None:
         self.suite, self.spp = suite, good_spp(spp, suite.spec)
         self._objects: dict[str, MitsubaScene] = {}
 
     def __call__(self, scene: Scene, material: MetallicRoughness, environment: Float[np.ndarray, "eh ew 3"]) -> Image:
-        """Linear image, premultiplied.
-
-        Raises:
-            UnirenderError: the generator makes another object here than the suite was rendered from.
-        """
+        """Linear image, premultiplied."""
         seed = item_seed("figures", scene.key, material)
         metallic, roughness = material
         found = self._object(scene).renderer.image(environment, roughness, metallic, self.spp, seed)
@@ -136,11 +127,7 @@ def relighting_grid(
 
 
 def other_lights(suite: Suite, scenes: Sequence[Scene], count: int) -> list[Scene]:
-    """Scenes whose lights are not those of `scenes`: each light once, evenly spaced over the suite.
-
-    Raises:
-        UnirenderError: the suite has no other light.
-    """
+    """Scenes whose lights are not those of `scenes`: each light once, evenly spaced over the suite."""
     own = {scene.light for scene in scenes}
     found = {scene.light: scene for scene in reversed(suite.scenes) if scene.light not in own}
     if not found:

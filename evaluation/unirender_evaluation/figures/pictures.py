@@ -44,12 +44,7 @@ def read_cut_out(path: Path) -> Picture:
 
 
 def framed(picture: Picture, side: int = SIDE) -> Picture:
-    """The object alone, in the middle of a square: what lies outside its bounding box is cut off.
-
-    Args:
-        picture: with a mask that covers something.
-        side: of the square, pixels.
-    """
+    """The object alone, in the middle of a square: what lies outside its bounding box is cut off."""
     assert picture.mask is not None, "read_cut_out has looked"
     rows, columns = (np.flatnonzero((picture.mask[..., 0] >= 0.5).any(axis=axis)) for axis in (1, 0))
     high, wide = int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
@@ -112,14 +107,7 @@ def _resized(
 def pictures_sheet(
     subjects: Sequence[Subject], pictures: Sequence[Picture], lights: Mapping[str, Environment], camera: Camera
 ) -> Grid:
-    """What every subject makes of pictures whose truth is unknown.
-
-    Args:
-        subjects: those that decompose take part.
-        pictures: squares, as `framed` gives them.
-        lights: environments to relight by, by name.
-        camera: that the pictures are taken to be seen through.
-    """
+    """What every subject makes of pictures whose truth is unknown."""
     lines = []
     for picture in pictures:
         assert picture.mask is not None, "framed gives one"
@@ -144,15 +132,7 @@ def pictures_sheet(
 def pictures_strip(
     subjects: Sequence[Subject], pictures: Sequence[Picture], what: str, values: Sequence[float], camera: Camera
 ) -> Grid:
-    """Pictures edited over values of "metallic" or "roughness"; the other parameter stays as it is found.
-
-    Args:
-        subjects: those that edit take part.
-        pictures: squares, as `framed` gives them.
-        what: the parameter.
-        values: that it gets.
-        camera: that the pictures are taken to be seen through.
-    """
+    """Pictures edited over values of "metallic" or "roughness"; the other parameter stays as it is found."""
     taking_part, lines = able(subjects, "edit", f"{what} strip"), []
     for picture in pictures:
         assert picture.mask is not None, "framed gives one"

@@ -23,12 +23,7 @@ class Decompositions(Generic[Found]):
     ) -> tuple[Found, float]:
         """The decomposition of a picture, and the seconds that it took before this call: 0 where it is made now.
 
-        Args:
-            image_srgb: the picture.
-            mask: its alpha.
-            camera: of the picture.
-            decompose: makes what is not there. What it raises is not kept.
-            told: whatever else the answer depends on.
+        `told` is whatever else the answer depends on. What `decompose` raises is not kept.
         """
         shown = f"{image_srgb.shape} {camera}".encode() + image_srgb.tobytes() + mask.tobytes() + told
         key = hashlib.sha256(shown).hexdigest()

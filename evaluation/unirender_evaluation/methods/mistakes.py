@@ -28,15 +28,10 @@ TONE, PLACE = 4.0, 1.0  # mean dB that tell: a biased map gains by another scale
 
 @dataclass(frozen=True)
 class Mistake:
-    """A usual mistake.
+    """A usual mistake."""
 
-    Attributes:
-        said: what undoes it, as a note says it.
-        least: mean gain in dB from which the note does.
-    """
-
-    said: str
-    least: float
+    said: str  # what undoes it, as a note says it
+    least: float  # mean gain in dB from which the note does
 
 
 MISTAKES: Mapping[str, Mistake] = {  # by the name of the metric that has the gain; of equal ones the first is said

@@ -46,15 +46,10 @@ MITSUBA = MethodInfo(
 
 @dataclass
 class MitsubaScene:
-    """One object of a suite, rendered and traced on demand; what is rendered at the truth's samples is kept.
-
-    Attributes:
-        suite: the suite.
-        scene: the object under one of its lights.
-    """
+    """One object of a suite, rendered and traced on demand; what is rendered at the truth's samples is kept."""
 
     suite: Suite
-    scene: Scene
+    scene: Scene  # the object under one of its lights
     _images: dict[str, Image] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -136,16 +131,7 @@ def prediction(task: Task, mitsuba: MitsubaScene) -> Prediction:
 def mitsuba_jobs(
     suite: Suite, scenes: Sequence[Scene], scene: Scene, key_of: KeyOf, backbones: Sequence[str], most: int | None
 ) -> Iterator[Job]:
-    """Mitsuba's records of one scene, the physics table's aside; possible where the object is here.
-
-    Args:
-        suite: the suite.
-        scenes: of the whole run.
-        scene: whose records are wanted.
-        key_of: makes content keys.
-        backbones: of LPIPS.
-        most: scenes of the run that the row takes part in, evenly spaced; None: all.
-    """
+    """Mitsuba's records of one scene, the physics table's aside; possible where the object is here."""
     if scene not in evenly(scenes, most):
         return
     mitsuba = MitsubaScene(suite, scene)

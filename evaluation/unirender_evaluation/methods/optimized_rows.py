@@ -4,19 +4,11 @@ from typing import Any
 
 from unirender_evaluation.methods.optimized import OPTIMISER, REFINED, OptimizedMethod
 from unirender_evaluation.rows import Row, make_row
-from unirender_evaluation.task import LIGHT
+from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.versions import MODEL, OPTIMIZER, REFERENCE
 from unirender_reference.optimize.single.config import COLD, fitted
 
-ASKED = frozenset(
-    {
-        ("rendering", "from-image"),
-        ("inverse", "single-image"),
-        ("relighting", "from-image-sd"),
-        ("relighting", "from-image-hdri"),
-        LIGHT,
-    }
-)
+ASKED = frozenset(PROTOCOLS) - {("rendering", "given"), ("rendering", "given-light")}
 USES = frozenset({OPTIMIZER, REFERENCE})
 
 
@@ -28,40 +20,15 @@ def optimized_rows(scenes: int | None, pictures: int | None = None, ours: Any = 
         pictures: of each scene in the inverse table; None: all.
         ours: our method, whose decomposition the refinement starts from; None: no such row.
     """
-    rows = [
-        make_row(
-            OptimizedMethod(OPTIMISER),
-            "optimisation",
-            published="NvDiffrec",
-            protocols=ASKED,
-            scenes=scenes,
-            pictures=pictures,
-            uses=USES,
-            note=f"one picture, shape from its silhouette; optimised and rendered by Mitsuba{_held(known_mesh=False)}",
-        ),
-        make_row(
-            OptimizedMethod(f"{OPTIMISER}, true mesh"),
-            "optimisation",
-            protocols=ASKED,
-            scenes=scenes,
-            pictures=pictures,
-            uses=USES,
-            told=frozenset({"geometry"}),
-            note=f"told the object's true mesh, which no other row sees{_held(known_mesh=True)}",
-        ),
-    ]
+    part: dict[str, Any] = {"protocols": ASKED, "scenes": scenes, "pictures": pictures}
+    note = f"one picture, shape from its silhouette; optimised and rendered by Mitsuba{_held(known_mesh=False)}"
+    rows = [make_row(OptimizedMethod(OPTIMISER), "optimisation", published="NvDiffrec", uses=USES, note=note, **part)]
+    note = f"told the object's true mesh, which no other row sees{_held(known_mesh=True)}"
+    told = OptimizedMethod(f"{OPTIMISER}, true mesh")
+    rows.append(make_row(told, "optimisation", uses=USES, told=frozenset({"geometry"}), note=note, **part))
     if ours is not None:
-        rows.append(
-            make_row(
-                OptimizedMethod(REFINED, base=ours),
-                "ours",
-                protocols=ASKED,
-                scenes=scenes,
-                pictures=pictures,
-                uses=USES | {MODEL},
-                note=f"starts from {ours.name}",
-            )
-        )
+        refined = OptimizedMethod(REFINED, base=ours)
+        rows.append(make_row(refined, "ours", uses=USES | {MODEL}, note=f"starts from {ours.name}", **part))
     return rows
 
 

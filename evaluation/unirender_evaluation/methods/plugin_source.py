@@ -52,10 +52,6 @@ def shadowed(kind: type, *makers: Any) -> Iterator[tuple[Path, Path]]:
     """Files beside a method's that its import statements name, each with the file that Python imports in its place.
 
     That is another method's, or lies earlier on the path. A name of Python's own library means Python's.
-
-    Args:
-        kind: the method's class.
-        *makers: what was called to make it, and the module that has it.
     """
     files, roots = _files_and_roots(kind, makers)
     for file in sorted(file for file in files if not _is_installed(file)):

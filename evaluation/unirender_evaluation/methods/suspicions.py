@@ -15,13 +15,7 @@ from unirender_evaluation.task import Task
 
 
 def suspicions(task: Task, image: Image | None, maps: Intrinsics | None) -> dict[str, float]:
-    """Metric key -> gain in dB of an answer by each usual mistake undone.
-
-    Args:
-        task: the question, with its truth.
-        image: the picture that answers it, linear, premultiplied.
-        maps: the maps that answer it.
-    """
+    """Metric key -> gain in dB of an answer by each usual mistake undone."""
     values: dict[str, float] = {}
     true, mask = task.truth_maps, task.mask
     if image is not None and task.truth_image is not None:

@@ -53,11 +53,7 @@ class ConstantObject:
 
 
 class Optimized:
-    """Our optimiser, all stages and ingredients.
-
-    Args:
-        config: of `unirender_reference.optimize.multiview.run.optimize`; None: its default.
-    """
+    """Our optimiser, all stages and ingredients."""
 
     name = OPTIMISED
 

@@ -57,17 +57,7 @@ def multiview_jobs(
     pictures: MultiviewPictures,
     settings: MultiviewSettings = STANDARD,
 ) -> Iterator[Job]:
-    """The records of the multi-view table on one scene; what they share is rendered when the first is made.
-
-    Args:
-        suite: the suite.
-        scene: the object, the light of the pictures and (the object's other one) that of relighting.
-        rows: whose methods have `solve`.
-        key_of: makes content keys.
-        backbones: LPIPS backbones.
-        pictures: keeps what the report shows.
-        settings: cameras and samples.
-    """
+    """The records of the multi-view table on one scene; what they share is rendered when the first is made."""
     question = f"{MULTIVIEW_TABLE.name}/{PROTOCOL}/{json.dumps(asdict(settings), sort_keys=True)}"
     shared = cache(lambda: suite_scene(suite, scene, settings))
     info = ceiling_info(suite)

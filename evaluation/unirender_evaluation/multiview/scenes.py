@@ -116,9 +116,7 @@ class MultiviewScene:
     def buffers_of(self, obj: MeshObject, material: tuple[float | None, float | None] = (None, None)) -> Intrinsics:
         """Albedo, roughness, metallic, normal and mask of an object from all cameras, `[cameras * h, w, c]`.
 
-        Args:
-            obj: the object.
-            material: (roughness, metallic), each a value or None for the object's own map.
+        `material` is (roughness, metallic), each a value or None for the object's own map.
         """
         found = []
         for index, pose in enumerate((*self.seen_poses, *self.held_out_poses)):

@@ -30,17 +30,11 @@ NEIGHBOURS = (".ssim@", ".lpips_")  # metrics that would see the seams between s
 
 @dataclass(frozen=True)
 class Looks:
-    """What an object looks like from the scene's cameras.
+    """What an object looks like from the scene's cameras."""
 
-    Attributes:
-        buffers: its maps from all cameras, one below the other.
-        novel: from the held-out cameras, under the light that belongs to it.
-        relit: the same under the scene's other light.
-    """
-
-    buffers: Intrinsics
-    novel: LitPictures
-    relit: LitPictures
+    buffers: Intrinsics  # its maps from all cameras, one below the other
+    novel: LitPictures  # from the held-out cameras, under the light that belongs to it
+    relit: LitPictures  # the same under the scene's other light
 
 
 def true_looks(scene: MultiviewScene) -> Looks:
@@ -60,14 +54,7 @@ def solution_looks(scene: MultiviewScene, solution: Solution) -> Looks:
 def score_solution(
     scene: MultiviewScene, solution: Solution, networks: Sequence[Lpips] = (), looks: Looks | None = None
 ) -> dict[str, float]:
-    """Metric key -> value of a result.
-
-    Args:
-        scene: with its truth.
-        solution: the object that was found, in the scene's world, and its light.
-        networks: LPIPS backbones.
-        looks: `solution_looks` of it, if it is there already.
-    """
+    """Metric key -> value of a result."""
     looks = solution_looks(scene, solution) if looks is None else looks
     values = score_maps(looks.buffers.replace(normal=None, mask=None), scene.buffers)
     values = {key: value for key, value in values.items() if not any(name in key for name in NEIGHBOURS)}

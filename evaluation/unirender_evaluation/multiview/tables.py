@@ -10,7 +10,8 @@ _IN_MASK = {"mask": "masked"}
 _ALIGNED = {"scale": "aligned"}
 
 
-def _column(group: str, quantity: str, metric: Metric | str, **overrides: str) -> Column:
+def plain_column(group: str, quantity: str, metric: Metric | str, **overrides: str) -> Column:
+    """A column of a metric, or of one of the benchmark's by its name; the paper has no number for it."""
     found = METRICS[metric] if isinstance(metric, str) else metric
     return Column(group, quantity, found, overrides, published=False)
 
@@ -19,16 +20,16 @@ MULTIVIEW_TABLE = TableSpec(
     "multi-view",
     "Multi-view inverse rendering",
     (
-        _column("Albedo", "albedo", "psnr", scale="raw"),
-        _column("Albedo (aligned)", "albedo", "psnr", **_ALIGNED),
-        _column("Roughness", "roughness", "mse", **_IN_MASK),
-        _column("Metallic", "metallic", "mse", **_IN_MASK),
-        _column("Light", "environment", SCALED_LOG_RMSE),
-        _column("Light", "environment", PEAK_ANGLE),
-        _column("Relit", "relit", "psnr", scale="raw"),
-        _column("Relit (aligned)", "relit", "psnr", **_ALIGNED),
-        *(_column("Novel view", "novel", name) for name in ("psnr", "ssim", "lpips_vgg", "lpips_alex")),
-        _column("Optimisation", "time", SECONDS),
+        plain_column("Albedo", "albedo", "psnr", scale="raw"),
+        plain_column("Albedo (aligned)", "albedo", "psnr", **_ALIGNED),
+        plain_column("Roughness", "roughness", "mse", **_IN_MASK),
+        plain_column("Metallic", "metallic", "mse", **_IN_MASK),
+        plain_column("Light", "environment", SCALED_LOG_RMSE),
+        plain_column("Light", "environment", PEAK_ANGLE),
+        plain_column("Relit", "relit", "psnr", scale="raw"),
+        plain_column("Relit (aligned)", "relit", "psnr", **_ALIGNED),
+        *(plain_column("Novel view", "novel", name) for name in ("psnr", "ssim", "lpips_vgg", "lpips_alex")),
+        plain_column("Optimisation", "time", SECONDS),
     ),
     (PROTOCOL,),
     "Pictures of an object under one light in; textures and light out. Maps: all cameras. Relit (under the object's "

@@ -49,15 +49,10 @@ ROUNDING = 1 / (12 * 255**2)  # variance of what 8 bits leave out
 
 @dataclass(frozen=True)
 class Nodes:
-    """Mitsuba's pictures at one roughness, of every metallic with every factor of the nodes.
+    """Mitsuba's pictures at one roughness, of every metallic with every factor of the nodes."""
 
-    Attributes:
-        radiance: linear, of the covered part of the object's pixels.
-        noise: mean D'^2 var of each.
-    """
-
-    radiance: Float[np.ndarray, "k p 3"]
-    noise: Float[np.ndarray, " k"]
+    radiance: Float[np.ndarray, "k p 3"]  # linear, of the covered part of the object's pixels
+    noise: Float[np.ndarray, " k"]  # mean D'^2 var of each
 
 
 class Explanations:

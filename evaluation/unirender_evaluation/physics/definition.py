@@ -16,46 +16,24 @@ from unirender_evaluation.physics.stage import Stage
 
 @dataclass(frozen=True)
 class PhysicsTest:
-    """One test.
+    """One test; `run`, `twin` and `expected` are of a renderer, a decomposer or a posterior, whichever it asks."""
 
-    Attributes:
-        name: as in records: the quantity of its metric key.
-        label: as in tables.
-        formula: one line; notation of `physics`.
-        metric: unit, direction and decimals.
-        expected: value of a perfect renderer, decomposer or posterior, noise apart; in words where it is the scene's.
-        asks: what it asks of.
-        run: (renderer, decomposer or posterior, stage) -> value.
-        twin: a broken renderer, decomposer or posterior.
-        twin_is: what is broken, in words.
-        margin: how much worse than Mitsuba on the same scenes counts as failing.
-        in_run: whether `bench run` measures it, or `bench physics` alone.
-    """
-
-    name: str
-    label: str
-    formula: str
-    metric: Metric
-    expected: float | str
+    name: str  # as in records: the quantity of its metric key
+    label: str  # as in tables
+    formula: str  # one line; notation of `physics`
+    metric: Metric  # unit, direction and decimals
+    expected: float | str  # value of a perfect one, noise apart; in words where it is the scene's
     asks: Literal["render", "decompose", "sample"]
-    run: Callable[[Any, Stage], float]
-    twin: Any
-    twin_is: str
-    margin: float
-    in_run: bool = True
+    run: Callable[[Any, Stage], float]  # (who is asked, stage) -> value
+    twin: Any  # a broken one
+    twin_is: str  # what is broken, in words
+    margin: float  # how much worse than Mitsuba on the same scenes counts as failing
+    in_run: bool = True  # whether `bench run` measures it, or `bench physics` alone
 
     @property
     def key(self) -> str:
         """The metric key of its value."""
         return metric_key(self.name, self.metric)
-
-    @property
-    def unit(self) -> str:
-        return self.metric.unit
-
-    @property
-    def direction(self) -> str:
-        return "higher is better" if self.metric.higher_is_better else "lower is better"
 
     def fails(self, value: float, mitsuba: float) -> bool:
         """Whether a value is worse than Mitsuba's by more than the margin."""

@@ -15,8 +15,7 @@ from jaxtyping import Float
 from unirender.intrinsics import Intrinsics
 from unirender.light.symmetries import mirror, quarter_turn, scale_light
 from unirender_evaluation.methods.composite import Composite
-from unirender_evaluation.methods.method import Image, Mask
-from unirender_evaluation.metrics import weighted_mean
+from unirender_evaluation.methods.method import Image
 
 Render = Callable[[Intrinsics], Image]
 FURNACE_RADIANCE = 0.5
@@ -125,8 +124,3 @@ def kendall_tau(true: Sequence[float], predicted: Sequence[float]) -> float:
     if np.ptp(predicted) == 0:
         return 0.0
     return float(np.asarray(kendalltau(true, predicted))[0])
-
-
-def map_mean(maps: Intrinsics, name: str, mask: Mask) -> float:
-    """Coverage-weighted mean of a one-channel map over the object."""
-    return weighted_mean(maps.require(name)[name], mask)

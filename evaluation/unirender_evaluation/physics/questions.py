@@ -10,7 +10,7 @@ import numpy as np
 
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.methods.method import Image
-from unirender_evaluation.metrics import METRICS, metric_key
+from unirender_evaluation.metrics import METRICS, metric_key, weighted_mean
 from unirender_evaluation.physics import formulas, region
 from unirender_evaluation.physics.ambiguity import Points
 from unirender_evaluation.physics.stage import LEVELS, ROUGH, Light, Shader, Stage
@@ -75,7 +75,8 @@ def tau(parameter: Literal["metallic", "roughness"], decompose: Decompose, stage
     """Kendall's tau of the found against the true parameter over the 11 pictures of its sweep."""
     m, r = stage.suite.spec.base
     sweep = [(level, r) if parameter == "metallic" else (m, level) for level in LEVELS]
-    found = [formulas.map_mean(decomposition(decompose, stage, at), parameter, stage.mask) for at in sweep]
+    maps = (decomposition(decompose, stage, at).require(parameter)[parameter] for at in sweep)
+    found = [weighted_mean(values, stage.mask) for values in maps]
     return formulas.kendall_tau(LEVELS, found)
 
 

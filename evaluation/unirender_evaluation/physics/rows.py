@@ -1,9 +1,8 @@
 """Runs the physics table: which row answers which test, on how many scenes."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import Any
 
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.bounds import SHADE_SPP, KeyOf
@@ -36,11 +35,6 @@ def physics_scenes(suite: Suite, scenes: list[Scene], most: int | None) -> list[
     if most is None or len(scenes) <= most:
         return scenes
     return [s for s in scene_ids(suite, most) if s in scenes] or scenes[:most]
-
-
-def renderer_values(render: Callable[[Intrinsics], Any], stage: Stage) -> dict[str, float]:
-    """Metric key -> value of a renderer's tests on one scene."""
-    return {TESTS[name].key: value for name, value in renderer_tests(render, stage).items()}
 
 
 def loop_values(maps: Intrinsics, stage: Stage) -> dict[str, float]:
@@ -92,7 +86,8 @@ def _record(stage: Stage, row: Row, key: str) -> Record:
     if callable(getattr(row.method, "render", None)):
         render = partial(ask, row, "render", f"physics/{scene.key}")
         with suppress(NoAnswer):
-            values |= renderer_values(lambda maps: render(intrinsics=maps), stage)
+            found = renderer_tests(lambda maps: render(intrinsics=maps), stage)
+            values |= {TESTS[name].key: value for name, value in found.items()}
     if callable(getattr(row.method, "decompose", None)):
         seen = picture(suite, scene, suite.spec.base)
         maps, _ = decomposition(row, seen, partial(ask, row, "decompose", f"physics/{scene.key}", **seen))

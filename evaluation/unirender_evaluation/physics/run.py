@@ -54,14 +54,7 @@ class Value:
 
 
 def measure(suite: Suite, scenes: Sequence[Scene], ours: Any, spp: int) -> Iterator[list[Value]]:
-    """The values of one test after another, scene by scene.
-
-    Args:
-        suite: the suite.
-        scenes: whose objects the generator makes here as the truth shows them.
-        ours: our method, with `render` and `decompose`; its `pipeline` samples.
-        spp: samples per pixel of Mitsuba's path tracer.
-    """
+    """The values of one test after another, scene by scene; `ours` renders and decomposes, its `pipeline` samples."""
     sampler = Sampler(ours.pipeline)
     for scene in scenes:
         stage = Stage(suite, scene)
@@ -73,11 +66,6 @@ def measure(suite: Suite, scenes: Sequence[Scene], ours: Any, spp: int) -> Itera
 def values_of(test: PhysicsTest, stage: Stage, asked: Mapping[str, Any]) -> list[Value]:
     """What each row scores in a test on a scene, as the table of `bench run` has it: a law that is asked of black
     pictures, or of none but clipped pixels, has no value.
-
-    Args:
-        test: the test.
-        stage: the scene.
-        asked: who answers, by the row's name.
     """
     scores = {row: test.run(subject, stage) for row, subject in asked.items()}
     key, name = stage.scene.key, stage.scene.object
@@ -85,14 +73,7 @@ def values_of(test: PhysicsTest, stage: Stage, asked: Mapping[str, Any]) -> list
 
 
 def subjects(test: PhysicsTest, tracer: PathTracer, ours: Any, sampler: Posterior | None = None) -> dict[str, Any]:
-    """Who answers a test: name of the row -> renderer, decomposer or posterior.
-
-    Args:
-        test: the test.
-        tracer: Mitsuba on the scene.
-        ours: our method.
-        sampler: our posterior; None: we have none.
-    """
+    """Who answers a test: name of the row -> renderer, decomposer or posterior."""
     if test.asks == "render":
         return {
             MITSUBA: tracer.render,
@@ -124,11 +105,7 @@ def _perfect(stage: Stage, *_: object) -> Points:
 
 
 class Sampler:
-    """The materials of a pipeline's samples; those for one picture are drawn once, since several tests ask.
-
-    Args:
-        pipeline: a `UniRenderPipeline`.
-    """
+    """The materials of a pipeline's samples; those for one picture are drawn once, since several tests ask."""
 
     def __init__(self, pipeline: Any) -> None:
         self._pipeline = pipeline
@@ -188,7 +165,8 @@ def markdown(found: Sequence[Finding], settings: dict[str, Any]) -> str:
         expected = test.expected if isinstance(test.expected, str) else f"{test.expected:g}"
         cells = [estimate_text(finding.rows.get(row), test.metric.decimals) for row in ROWS]
         verdict = "PASS" if finding.refused else "FAIL"
-        heading = f"{test.label} ({test.metric.label}{f', {test.unit}' if test.unit else ''}) {test.metric.arrow}"
+        unit = f", {test.metric.unit}" if test.metric.unit else ""
+        heading = f"{test.label} ({test.metric.label}{unit}) {test.metric.arrow}"
         lines.append(markdown_row((heading, expected, *cells, f"{verdict}: {test.twin_is}")))
     protocol = " · ".join(f"{name}: {value}" for name, value in settings.items())
     notes = unprinted_note(estimate for finding in found for estimate in finding.rows.values())
@@ -203,8 +181,8 @@ def write(out: Path, values: Sequence[Value], settings: dict[str, Any]) -> list[
         {
             "name": f.test.name,
             "formula": f.test.formula,
-            "unit": f.test.unit,
-            "direction": f.test.direction,
+            "unit": f.test.metric.unit,
+            "direction": "higher is better" if f.test.metric.higher_is_better else "lower is better",
             "expected": f.test.expected,
             "margin": f.test.margin,
             "twin": f.test.twin_is,

@@ -34,15 +34,10 @@ SHADERS: dict[str, Callable[[Intrinsics, Any], Image]] = {"shade": shade_under, 
 
 @dataclass
 class Stage:
-    """A scene with all that a test may ask of it.
-
-    Attributes:
-        suite: the suite.
-        scene: the object under the light of its pictures ("input"); its other light is the held-out one.
-    """
+    """A scene with all that a test may ask of it."""
 
     suite: Suite
-    scene: Scene
+    scene: Scene  # the object under the light of its pictures ("input"); its other light is the held-out one
     _shaded: dict[str, Image] = field(default_factory=dict, repr=False)
 
     @cached_property

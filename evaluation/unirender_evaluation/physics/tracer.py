@@ -53,10 +53,6 @@ POSES = (
 class PathTracer:
     """Renders the maps that the physics tests make of one scene, all with one seed, as `shade` does: what is linear
     in the samples comes out exactly, the rest to within noise.
-
-    Args:
-        stage: the scene.
-        spp: samples per pixel.
     """
 
     def __init__(self, stage: Stage, spp: int) -> None:
@@ -70,11 +66,7 @@ class PathTracer:
         return {pose.name: pose.of_maps(self.stage.base).require("normal")["normal"] for pose in POSES}
 
     def render(self, maps: Intrinsics) -> Image:
-        """The picture, linear and premultiplied.
-
-        Raises:
-            UnirenderError: maps that no physics test makes of this scene.
-        """
+        """The picture, linear and premultiplied."""
         found = maps.require("albedo", "normal", "metallic", "roughness", "environment", "mask")
         pose = next((p for p in POSES if np.array_equal(found["normal"], self._normals[p.name])), None)
         if pose is None:

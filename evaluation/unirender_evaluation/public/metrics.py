@@ -62,19 +62,12 @@ def channel_factors(p: Rgb, t: Rgb, m: OneMask) -> Float[np.ndarray, " 3"]:
 
 @dataclass(frozen=True)
 class OrbPsnr:
-    """Stanford-ORB's PSNR of one picture.
+    """Stanford-ORB's PSNR of one picture."""
 
-    Attributes:
-        value: dB, at least `floor`.
-        floor: dB, of the constant 0.5 inside the mask: the benchmark prints no lower value.
-        shown: the prediction as compared: scaled, clipped, masked, encoded where PSNR-L encodes.
-        truth: the truth likewise.
-    """
-
-    value: float
-    floor: float
-    shown: Rgb
-    truth: Rgb
+    value: float  # dB, at least `floor`
+    floor: float  # dB, of the constant 0.5 inside the mask: the benchmark prints no lower value
+    shown: Rgb  # the prediction as compared: scaled, clipped, masked, encoded where PSNR-L encodes
+    truth: Rgb  # the truth likewise
 
 
 def orb_psnr(p: Rgb, t: Rgb, m: OneMask, *, peak: float, lift: bool, encode: bool, aligned: bool) -> OrbPsnr:
@@ -151,19 +144,12 @@ def depth_si_mse(p: OneMask, t: OneMask, m: OneMask) -> float:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What people said of two points of a photograph.
+    """What people said of two points of a photograph."""
 
-    Attributes:
-        first: x and y of a point as fractions of width and height, from the top-left corner.
-        second: of the other.
-        darker: "1" or "2", the point of darker reflectance; "E", about equal.
-        weight: confidence, > 0.
-    """
-
-    first: tuple[float, float]
-    second: tuple[float, float]
-    darker: str
-    weight: float
+    first: tuple[float, float]  # x and y of a point as fractions of width and height, from the top-left corner
+    second: tuple[float, float]  # of the other
+    darker: str  # "1" or "2", the point of darker reflectance; "E", about equal
+    weight: float  # confidence, > 0
 
 
 def judgements(content: Mapping[str, Any]) -> list[Judgement]:

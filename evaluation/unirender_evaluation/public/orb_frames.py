@@ -22,21 +22,13 @@ NAMES = (re.compile(r"(?P<object>.+)_scene\d+"), re.compile(r"scene\d+_(?P<objec
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph of a capture.
+    """One photograph of a capture."""
 
-    Attributes:
-        capture: name of its folder.
-        split: "test" or "train".
-        id: name of its files without suffix.
-        angle_x: horizontal field of view, radians.
-        pose: camera to world, OpenGL axes (those of our contract); rows of a 4 x 4 matrix.
-    """
-
-    capture: str
-    split: str
-    id: str
-    angle_x: float
-    pose: tuple[tuple[float, ...], ...]
+    capture: str  # name of its folder
+    split: str  # "test" or "train"
+    id: str  # name of its files without suffix
+    angle_x: float  # horizontal field of view, radians
+    pose: tuple[tuple[float, ...], ...]  # camera to world, OpenGL axes (those of our contract); rows of a 4 x 4 matrix
 
     def photo(self, folder: Path, kind: str = LDR) -> Path:
         """Its file among the LDR or the HDR photographs."""
@@ -62,23 +54,14 @@ class Photograph:
 
 @dataclass(frozen=True)
 class Capture:
-    """One object in one place.
+    """One object in one place."""
 
-    Attributes:
-        name: of its folder.
-        object: the object, in every place.
-        test: photographs that maps are asked of.
-        train: the other photographs.
-        novel: photographs of the object elsewhere, posed in this capture's world.
-        files: the transforms_*.json that say so.
-    """
-
-    name: str
-    object: str
-    test: tuple[Photograph, ...]
-    train: tuple[Photograph, ...]
-    novel: tuple[Photograph, ...]
-    files: tuple[Path, ...]
+    name: str  # of its folder
+    object: str  # the object, in every place
+    test: tuple[Photograph, ...]  # photographs that maps are asked of
+    train: tuple[Photograph, ...]  # the other photographs
+    novel: tuple[Photograph, ...]  # photographs of the object elsewhere, posed in this capture's world
+    files: tuple[Path, ...]  # the transforms_*.json that say so
 
     def nearest(self, novel: Photograph, tolerance_deg: float) -> Photograph | None:
         """The photograph of this capture from nearly the same camera as a novel frame's; None where there is none."""

@@ -41,23 +41,14 @@ from unirender_reference.folder_lock import locked, made_folder
 
 @dataclass(frozen=True)
 class PublicRun:
-    """What is scored.
-
-    Attributes:
-        public: the set.
-        rows: the rows.
-        out: folder of the run; an earlier run in it is continued.
-        limit: samples, evenly spaced; the tables are then watermarked.
-        backbones: of LPIPS.
-        versions: of the code.
-    """
+    """What is scored."""
 
     public: PublicSet
     rows: tuple[Row, ...]
-    out: Path
-    limit: int | None
-    backbones: tuple[str, ...]
-    versions: Versions
+    out: Path  # folder of the run; an earlier run in it is continued
+    limit: int | None  # samples, evenly spaced; the tables are then watermarked
+    backbones: tuple[str, ...]  # of LPIPS
+    versions: Versions  # of the code
 
     @classmethod
     def of(cls, public: PublicSet, rows: Sequence[Row], out: Path, limit: int | None = None) -> "PublicRun":

@@ -45,27 +45,16 @@ class PublicSetError(UnirenderError):
 
 @dataclass(frozen=True)
 class Sample:
-    """One question about one photograph.
+    """One question about one photograph."""
 
-    Attributes:
-        table: of the record.
-        key: of the record: unique in its table.
-        object: what intervals are over: samples of one object or scene are not independent.
-        asks: what of a method.
-        folder: name of the subfolder in which a folder of predictions answers it.
-        answer: name of the answer's file there, without suffix.
-        files: all that the question and its truth are read from.
-        one_picture: whether a single photograph suffices to answer it: else only folders of predictions may.
-    """
-
-    table: str
-    key: str
-    object: str
-    asks: Asks
-    folder: str
-    answer: str
-    files: tuple[Path, ...]
-    one_picture: bool = True
+    table: str  # of the record
+    key: str  # of the record: unique in its table
+    object: str  # what intervals are over: samples of one object or scene are not independent
+    asks: Asks  # what of a method
+    folder: str  # name of the subfolder in which a folder of predictions answers it
+    answer: str  # name of the answer's file there, without suffix
+    files: tuple[Path, ...]  # all that the question and its truth are read from
+    one_picture: bool = True  # whether a single photograph suffices to answer it: else only folders of predictions may
 
     @property
     def protocol(self) -> str:

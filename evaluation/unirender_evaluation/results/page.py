@@ -60,19 +60,12 @@ class Shown(str):
 
 @dataclass(frozen=True)
 class Page:
-    """The stored results that the page is made of.
+    """The stored results that the page is made of."""
 
-    Attributes:
-        standard: `small` on the suite `standard`, of which all tables are that say nothing else.
-        enlarged: `tiny` on the same suite, its maps enlarged.
-        tiny: `tiny` on its own suite.
-        suite: `standard`.
-    """
-
-    standard: Results
-    enlarged: Results
-    tiny: Results
-    suite: Suite
+    standard: Results  # `small` on the suite `standard`, of which all tables are that say nothing else
+    enlarged: Results  # `tiny` on the same suite, its maps enlarged
+    tiny: Results  # `tiny` on its own suite
+    suite: Suite  # `standard`
 
     @classmethod
     def read(cls, evaluation: Path | str) -> "Page":

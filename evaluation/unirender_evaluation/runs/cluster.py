@@ -27,21 +27,13 @@ PAUSE = 0.1  # seconds between two looks at what is under way; a scene takes man
 
 @dataclass(frozen=True)
 class Order:
-    """What a cluster's worker needs to make a `Run` like the caller's; it pickles.
+    """What a cluster's worker needs to make a `Run` like the caller's; it pickles."""
 
-    Attributes:
-        name: of the run: a worker that has made it keeps it.
-        build: makes the rows; paths in it are absolute.
-        suite: name of a bundled suite, or absolute path of its TOML file.
-        suite_sha256: of its truth.
-        scenes, versions, backbones, subsets: as in `Run`.
-    """
-
-    name: str
-    build: Callable[[], Sequence[Row]]
-    suite: str
-    suite_sha256: str
-    scenes: tuple[str, ...]
+    name: str  # of the run: a worker that has made it keeps it
+    build: Callable[[], Sequence[Row]]  # makes the rows; paths in it are absolute
+    suite: str  # name of a bundled suite, or absolute path of its TOML file
+    suite_sha256: str  # of its truth
+    scenes: tuple[str, ...]  # their keys
     versions: Versions
     backbones: tuple[str, ...]
     subsets: Subsets
@@ -98,12 +90,7 @@ def run_on_cluster(
 ) -> Generator[list[Record], None, None]:
     """Records of scenes from a cluster's workers, a scene at a time as they come; pictures are written here.
 
-    Args:
-        run: what the run is.
-        build: makes the rows in each worker.
-        suite: see `Order`.
-        wanted: scene -> content keys of its records.
-        address: see `unirender_reference.cluster.connect`.
+    `wanted` has the content keys of each scene's records.
 
     Raises:
         UnirenderError: as `connect`; a worker cannot do it, or several died over a scene.

@@ -75,11 +75,7 @@ class BenchRun:
     maps)`, the physics and the multi-view table."""
 
     def check(self) -> None:
-        """Looks at the values.
-
-        Raises:
-            UsageError: one is outside its range, or of another form.
-        """
+        """Looks at the values; `UsageError` where one is outside its range, or of another form."""
         at_least(1, limit=self.limit)
         at_least(0, check_scenes=self.check_scenes, check_seed=self.check_seed)
         at_least(0, sample_scenes=self.sample_scenes, jobs=self.jobs)

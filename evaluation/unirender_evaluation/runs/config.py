@@ -31,45 +31,24 @@ BOUNDS = (  # keys that no row of a stranger may have
 
 @dataclass(frozen=True)
 class BenchConfig:
-    """A benchmark run.
-
-    Attributes:
-        suite: name of a bundled suite, or path of a TOML file.
-        out: folder of the run; an earlier run in it is continued.
-        checkpoint: folder of our model, or the name of a shipped one; None = the shipped one for the suite's pictures.
-        methods: groups of rows: ours; optimisation (each picture, and the multi-view table); trivial; plugins
-            (installed). A stranger's row always brings the trivial ones.
-        method: further methods, each `module:Class` or `path/to/file.py:Class` (see `plugins`).
-        predictions: name -> folder of somebody's predictions.
-        limit: scenes (evenly spaced); the tables are then watermarked.
-        seed: of sampling methods.
-        check_scenes: scenes that Mitsuba renders again on the spot; 0 = none.
-        check_seed: chooses them; None = drawn anew in a new folder, kept in a folder that is continued.
-        recheck: render them again also where the folder holds the same check.
-        jobs: worker processes, each with one thread; 0 = all in this one.
-        cluster: workers of a cluster instead, see `unirender_reference.cluster.connect`; the truth check and the
-            multi-view table stay in this process.
-        device: of our model: auto, cpu, cuda or mps.
-        subsets: scenes of the slow parts.
-        variants: of the tables (see `tables.build_tables`); records have all of them.
-    """
+    """A benchmark run: the options of `bench run` (`runs.command.BenchRun`), taken apart."""
 
     suite: str = "tiny"
     out: Path = Path("results")
     checkpoint: Path | None = None
-    methods: tuple[str, ...] = GROUPS
+    methods: tuple[str, ...] = GROUPS  # a stranger's row always brings the trivial ones
     method: tuple[str, ...] = ()
-    predictions: dict[str, Path] = field(default_factory=dict)
+    predictions: dict[str, Path] = field(default_factory=dict)  # name -> folder
     limit: int | None = None
     seed: int = 0
     check_scenes: int = 4
     check_seed: int | None = None
     recheck: bool = False
-    jobs: int = 2
-    cluster: str | None = None
+    jobs: int = 2  # worker processes, each with one thread; 0 = all in this one
+    cluster: str | None = None  # `unirender_reference.cluster.connect`; truth check and multi-view table stay here
     device: str = "cpu"
-    subsets: Subsets = STANDARD
-    variants: tuple[Variant, ...] | None = None
+    subsets: Subsets = STANDARD  # scenes of the slow parts
+    variants: tuple[Variant, ...] | None = None  # of the tables (`build_tables`); records have all of them
 
     def weights(self) -> Path:
         """The folder of our model."""

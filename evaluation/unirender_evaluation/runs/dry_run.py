@@ -26,19 +26,12 @@ from unirender_evaluation.truth.check import scenes_here
 
 @dataclass(frozen=True)
 class PlannedRow:
-    """What a run has to do for one row.
+    """What a run has to do for one row."""
 
-    Attributes:
-        label: of the row.
-        stored: records that are there.
-        missing: records that would be computed.
-        seconds: mean time of an answer, of the stored records that have one; None = not measured.
-    """
-
-    label: str
-    stored: int
-    missing: int
-    seconds: float | None = None
+    label: str  # of the row
+    stored: int  # records that are there
+    missing: int  # records that would be computed
+    seconds: float | None = None  # mean time of an answer, of the stored records that have one; None = not measured
 
 
 @dataclass(frozen=True)

@@ -41,19 +41,12 @@ DRAWS = 1000  # of a seed whose scenes meet those of a limited run
 
 @dataclass(frozen=True)
 class CheckRequest:
-    """What is to be checked.
+    """What is to be checked."""
 
-    Attributes:
-        path: of `truth_check.json`.
-        scenes: how many; 0 = nothing is checked.
-        seed: chooses them and the render seeds; None = that of the stored check, or one drawn at random.
-        again: render also where the stored check would do.
-    """
-
-    path: Path
-    scenes: int
-    seed: int | None = None
-    again: bool = False
+    path: Path  # of `truth_check.json`
+    scenes: int  # how many; 0 = nothing is checked
+    seed: int | None = None  # of scenes and renders; None = that of the stored check, or one drawn at random
+    again: bool = False  # render also where the stored check would do
 
     @property
     def renders(self) -> TruthRenders:
@@ -68,13 +61,6 @@ def run_check(
 
     Where no scene is asked for, or no object of the suite is here, its truth is not rendered again: `passed` is None,
     and no file is written.
-
-    Args:
-        request: what is to be checked.
-        here: the run.
-        store: of the run.
-        progress: gets a bar while Mitsuba renders.
-        say: prints one line.
     """
     if not request.scenes:
         return _none("--check-scenes 0", "--check-scenes 0")
@@ -122,13 +108,7 @@ def _none(reason: str, unchecked: str) -> dict[str, Any]:
 
 
 def stored_check(request: CheckRequest, here: Run, known: Collection[str]) -> dict[str, Any] | None:
-    """The check in the run's folder, if it is the one that is asked for.
-
-    Args:
-        request: what is to be checked.
-        here: the run.
-        known: content keys of the records in its folder.
-    """
+    """The check in the run's folder, if it is the one that is asked for."""
     stored = read_check(request.path)
     complete = all(key in known for key in stored.get("records", {}))
     same = stored.get("identity") == _identity(request, here) and request.seed in (None, stored.get("seed"))
@@ -187,7 +167,8 @@ def _rendered(request: CheckRequest, here: Run, progress: Progress, say: Callabl
 
 def _records(outcome: TruthCheck, info: MethodInfo, here: Run) -> list[tuple[Record, Scene]]:
     """The re-rendered truth as predictions, scored."""
-    images, version, found = bounds.reference_images(outcome), here.versions.of({REFERENCE, LPIPS}), []
+    images = {check.name: check.mean for check in outcome.checks}
+    version, found = here.versions.of({REFERENCE, LPIPS}), []
     for table, protocol in PROTOCOLS:
         for task in tasks(here.suite, table, protocol, list(here.suite.scenes)):
             image, maps = bounds.reference_prediction(task, images, here.suite)

@@ -31,25 +31,15 @@ from unirender_evaluation.versions import Versions
 
 @dataclass
 class Run:
-    """What one process needs to work on scenes: `rows` may load models, each process its own.
-
-    Attributes:
-        suite: the suite.
-        rows: the rows.
-        scenes: of the whole run.
-        versions: of the code and of what it depends on; part of every content key.
-        backbones: LPIPS backbones.
-        pictures: folder of the gallery's predictions.
-        subsets: scenes of the slow parts.
-    """
+    """What one process needs to work on scenes: `rows` may load models, each process its own."""
 
     suite: Suite
     rows: Sequence[Row]
-    scenes: list[Scene]
-    versions: Versions
-    backbones: tuple[str, ...]
-    pictures: Path
-    subsets: Subsets = STANDARD
+    scenes: list[Scene]  # of the whole run
+    versions: Versions  # of the code and of what it depends on; part of every content key
+    backbones: tuple[str, ...]  # LPIPS backbones
+    pictures: Path  # folder of the gallery's predictions
+    subsets: Subsets = STANDARD  # scenes of the slow parts
 
     def jobs(self, scene: Scene) -> Iterator[Job]:
         """Every record that the run wants of one scene, the multi-view table's aside."""
@@ -74,27 +64,18 @@ class Run:
 
 @dataclass(frozen=True)
 class _Setup:
-    """What a process of this machine needs to make a `Run` like the caller's; it pickles.
+    """What a process of this machine needs to make a `Run` like the caller's; it pickles."""
 
-    Attributes:
-        build: makes the rows, which have to have these `configs`, by their keys.
-        suite: path of its TOML file.
-        scenes: their keys.
-        versions, backbones, pictures, subsets: as in `Run`.
-        known: content keys of records that are there.
-        notes: folder in which each process says what it has under way, and hands over its records (`Journals`).
-    """
-
-    build: Callable[[], Sequence[Row]]
-    configs: Mapping[str, Any]
-    suite: Path
-    scenes: tuple[str, ...]
+    build: Callable[[], Sequence[Row]]  # makes the rows
+    configs: Mapping[str, Any]  # that these rows have to have, by their keys
+    suite: Path  # path of its TOML file
+    scenes: tuple[str, ...]  # their keys
     versions: Versions
     backbones: tuple[str, ...]
     pictures: Path
     subsets: Subsets
-    known: frozenset[str]
-    notes: Path
+    known: frozenset[str]  # content keys of records that are there
+    notes: Path  # folder in which each process says what it has under way, and hands over its records (`Journals`)
 
     def run(self) -> Run:
         suite, rows = load_suite(self.suite), same_rows(self.build(), self.configs)
@@ -127,15 +108,7 @@ def _start(setup: _Setup) -> None:
 
 
 def same_rows(rows: Sequence[Row], configs: Mapping[str, Any]) -> Sequence[Row]:
-    """The rows as they are, if they are those of the process that asks.
-
-    Args:
-        rows: made here.
-        configs: made there, by the rows' keys.
-
-    Raises:
-        UnirenderError: a row has another configuration here, so that its records would have other keys.
-    """
+    """The rows as they are, if they are those of the process that asks."""
     for row in rows:
         if row.config != configs.get(row.info.key):
             raise UnirenderError(
@@ -167,9 +140,6 @@ def _scene(key: str) -> UnirenderError | None:
 class Journals:
     """The records that worker processes have made, each in a file of its own: a queue is left locked, or with half a
     record, by a process that is killed while it writes.
-
-    Args:
-        folder: of the files.
     """
 
     def __init__(self, folder: Path) -> None:

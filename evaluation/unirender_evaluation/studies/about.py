@@ -20,13 +20,7 @@ def today() -> str:
 
 
 def description(suite: Suite, code: str, **more: str) -> dict[str, str]:
-    """What a reader must know to compare.
-
-    Args:
-        suite: whose scenes.
-        code: versions of what the figures depend on.
-        more: of the study alone.
-    """
+    """What a reader must know to compare."""
     return {
         "suite": f"{suite.spec.name} {suite.sha256[:12]}",
         "resolution": f"{suite.spec.resolution}",

@@ -1,37 +1,41 @@
-"""What the tables of studies share: columns, and cells that say how far a row is from the one it is compared with."""
+"""What the tables of studies share: means, paired differences, and cells that say how far a row is
+from the one that it is compared with."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from unirender_evaluation.metrics import METRICS, Metric
-from unirender_evaluation.statistics import Estimate
+from unirender_evaluation.comparisons import values_of
+from unirender_evaluation.metrics import DEFAULT_VARIANT
+from unirender_evaluation.records import Record
+from unirender_evaluation.statistics import Estimate, mean_estimate, paired_difference
 from unirender_evaluation.tables.formats import format_number, json_number, signed
 from unirender_evaluation.tables.specs import Column
 
 
-def study_column(group: str, quantity: str, metric: Metric | str, **overrides: str) -> Column:
-    """A column of a metric, or of one of the benchmark's by its name; the paper has no number for it."""
-    return Column(group, quantity, METRICS[metric] if isinstance(metric, str) else metric, overrides, published=False)
-
-
 @dataclass(frozen=True)
 class Cell:
-    """One number of a row.
+    """One number of a row."""
 
-    Attributes:
-        mean: over objects.
-        n: how many.
-        difference: from the row that all are compared with (None in that row itself), paired.
-    """
-
-    mean: float
-    n: int
-    difference: Estimate | None
+    mean: float  # over objects
+    n: int  # how many
+    difference: Estimate | None  # from the row that all are compared with (None in that row itself), paired
 
     @property
     def decided(self) -> bool:
         """Whether the interval of the difference excludes 0."""
         return self.difference is not None and (self.difference.low > 0 or self.difference.high < 0)
+
+
+def row_cells(records: Sequence[Record], method: str, base: str, columns: Sequence[Column]) -> tuple[Cell, ...]:
+    """The cells of a row in the order of the columns, compared with the row `base`."""
+    objects = {record.sample: record.object for record in records}
+    found = []
+    for column in columns:
+        own, other = (values_of(records, name, column.key(DEFAULT_VARIANT)) for name in (method, base))
+        change = None if method == base else paired_difference(own, other, objects)
+        found.append(Cell(sum(own.values()) / len(own), len(own), change))
+    return tuple(found)
 
 
 def cell_text(cell: Cell, decimals: int) -> str:
@@ -43,6 +47,21 @@ def cell_text(cell: Cell, decimals: int) -> str:
     if not math.isnan(cell.difference.half_width):
         change += f" ± {format_number(cell.difference.half_width, decimals)}"
     return f"{text} (**{change}**)" if cell.decided else f"{text} ({change})"
+
+
+def estimate(records: Sequence[Record], method: str, key: str) -> Estimate | None:
+    """The mean of one value over the records of a method; None where none has it."""
+    own = [record for record in records if record.method == method and key in record.values]
+    return mean_estimate([r.values[key] for r in own], [r.object for r in own]) if own else None
+
+
+def difference(records: Sequence[Record], a: str, b: str, column: Column) -> Estimate | None:
+    """a - b of one column, paired by sample; None where there is none or one is infinite."""
+    first, second = (values_of(records, method, column.key(DEFAULT_VARIANT)) for method in (a, b))
+    common = first.keys() & second.keys()
+    if not common or not all(math.isfinite(values[sample]) for values in (first, second) for sample in common):
+        return None
+    return paired_difference(first, second, {record.sample: record.object for record in records})
 
 
 def as_json(found: Estimate | None) -> dict[str, float | str | int | None] | None:

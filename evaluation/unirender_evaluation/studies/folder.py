@@ -14,11 +14,7 @@ from unirender_reference.folder_lock import locked, made_folder
 
 @contextlib.contextmanager
 def open_folder(path: Path) -> Iterator[Path]:
-    """A folder to write to, made if it is not there, and held against a second run.
-
-    Raises:
-        UnirenderError: it cannot be made, or another run writes to it.
-    """
+    """A folder to write to, made if it is not there, and held against a second run."""
     with made_folder(path), locked(path):
         yield path
 
@@ -32,16 +28,7 @@ def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
 def write_study(
     stem: Path, tables: Sequence[TextTable], below: Mapping[str, object], content: str, counts: str, console: Console
 ) -> None:
-    """Writes `.md` (tables, and what one must know below them) and `.json`, and shows the tables.
-
-    Args:
-        stem: of both files' names, in an open folder.
-        tables: of the study.
-        below: (what, value) of the line below them.
-        content: of the JSON.
-        counts: what the last line on the terminal says of the records.
-        console: to show the tables on.
-    """
+    """Writes `.md` (tables, and what one must know below them) and `.json`, and shows the tables."""
     text = "\n".join([*(table.markdown() for table in tables), line(below)])
     write_files(stem.parent, {f"{stem.name}.md": text, f"{stem.name}.json": content})
     for table in tables:

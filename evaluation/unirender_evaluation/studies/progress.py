@@ -11,14 +11,7 @@ from unirender_evaluation.records import Record
 def collect(
     measured: Iterable[tuple[Record, bool]], total: int, title: str, console: Console
 ) -> tuple[list[Record], int]:
-    """All records, and how many of them are new, under a bar.
-
-    Args:
-        measured: records, and whether each was measured now; measured as they are asked for.
-        total: how many there will be.
-        title: what the bar says until the first record is there; then it names the last one.
-        console: to show it on.
-    """
+    """All records, and how many of them are new, under a bar."""
     records, computed = [], 0
     with progress_bar(console) as progress:
         bar = progress.add_task(title, total=total)

@@ -30,11 +30,6 @@ Row = TypeVar("Row", bound=StudyRow)
 def chosen(rows: Sequence[Row], names: Sequence[str], option: str) -> tuple[Row, ...]:
     """The rows with these names, or of these groups, in their order; rows without a group are always among them.
 
-    Args:
-        rows: to choose from.
-        names: of rows and of groups; none: all rows.
-        option: that the names come from, for the message.
-
     Raises:
         UsageError: there is no such row or group.
     """

@@ -9,11 +9,7 @@ FILES_KEYS = {"files", "holdout", "without", "count", "seed"}
 
 
 def value_problems(flat: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the values of a suite's file, whose keys are complete.
-
-    Args:
-        flat: the file's values by attribute of `SuiteSpec`.
-    """
+    """What is wrong with the values of a suite's file, whose keys are complete."""
     found = [
         f"{name} is {flat[name]!r}, expected {expected}"
         for names, good, expected in RULES

@@ -138,12 +138,6 @@ def _from(home_folder: Path, folder: Path) -> str:
 def with_folder(text: str, path: Path, key: str, value: str) -> str:
     """The text of a TOML file with another value of a key of its table [folders]; comments and layout stay.
 
-    Args:
-        text: of the file.
-        path: of the file, for the message.
-        key: of the table; it need not be there yet, nor the table.
-        value: the new one.
-
     Raises:
         UnirenderError: the file writes the table or the key in a way that is not recognised here.
     """

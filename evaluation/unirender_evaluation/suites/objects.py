@@ -22,15 +22,10 @@ GREY = 0.5  # base colour of a mesh that says nothing of the object's own
 
 @dataclass(frozen=True)
 class ObjectSource:
-    """Where an object of a suite comes from.
+    """Where an object of a suite comes from."""
 
-    Attributes:
-        split: of the generator's seeds.
-        origin: a seed of the generator; or a file, named by its path below the folder of objects.
-    """
-
-    split: Literal["train", "test"]
-    origin: int | MeshFile
+    split: Literal["train", "test"]  # of the generator's seeds
+    origin: int | MeshFile  # a seed of the generator; or a file, named by its path below the folder of objects
 
     @property
     def name(self) -> int | str:

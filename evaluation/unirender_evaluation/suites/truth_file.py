@@ -42,9 +42,7 @@ from unirender_evaluation.suites.stratification import MetallicRoughness, materi
 Kind = Literal["image", "specular", "diffuse"]
 Rgb = Float[np.ndarray, "h w 3"]
 STD_FLOOR = 1e-3
-STD_MANTISSA_BITS = (
-    4  # of the stored standard deviation: 3 % steps, far inside its own sampling error, and it compresses
-)
+STD_MANTISSA_BITS = 4  # of the stored std: 3 % steps, far inside its own sampling error, and it compresses
 CEILING = "ceiling/"
 PREFIX: Mapping[Kind, str] = {"image": "", "specular": "specular.", "diffuse": "diffuse."}
 
@@ -117,18 +115,12 @@ def _half(value: Rgb) -> Rgb:
 
 @dataclass(frozen=True)
 class Stored:
-    """A member of a tar file, read when it is asked for: the truth of a large suite does not fit into memory.
+    """A member of a tar file, read when it is asked for: the truth of a large suite does not fit into memory."""
 
-    Attributes:
-        path: of the tar file.
-        offset, size: of the member, bytes.
-        state: (inode, time of the last change) of the tar file when it was listed.
-    """
-
-    path: Path
-    offset: int
-    size: int
-    state: tuple[int, int]
+    path: Path  # of the tar file
+    offset: int  # of the member, bytes
+    size: int  # the same
+    state: tuple[int, int]  # (inode, time of the last change) of the tar file when it was listed
 
     def read(self) -> bytes:
         """The member's bytes.

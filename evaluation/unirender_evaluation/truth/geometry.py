@@ -35,15 +35,10 @@ TOLERANCES: Mapping[str, float] = {
 
 @dataclass(frozen=True)
 class GeometryTest:
-    """Differences between two traces of one object's mask, albedo and normal, by the names of `TOLERANCES`.
-
-    Attributes:
-        differences: their values.
-        factor: of all tolerances.
-    """
+    """Differences between two traces of one object's mask, albedo and normal, by the names of `TOLERANCES`."""
 
     differences: Mapping[str, float]
-    factor: float = 1.0
+    factor: float = 1.0  # of all tolerances
 
     def tolerance(self, name: str) -> float:
         """The largest difference of a name that is allowed."""
@@ -65,11 +60,6 @@ class GeometryTest:
 
 def compare_geometry(stored: Intrinsics, again: Intrinsics, spp: int = TOLERANCE_SPP) -> GeometryTest:
     """Compares two traces of mask, albedo and normal: strictly inside, where both cover the pixel, loosely at edges.
-
-    Args:
-        stored: a trace.
-        again: another one.
-        spp: samples per pixel of each.
 
     Raises:
         UnirenderError: the object covers no pixel in either.

@@ -106,11 +106,7 @@ def make_truth(
 def _checked(
     spec: SuiteSpec, sources: Sequence[ObjectSource], lights: Sequence[str], pool: Pool
 ) -> dict[str, SuiteLight]:
-    """The lights of these names, once every mesh and every one of them has been read.
-
-    Raises:
-        UnirenderError: all meshes and all lights that cannot be used.
-    """
+    """The lights of these names, once every mesh and every one of them has been read."""
     problems: list[str] = []
     broken = list(broken_meshes(sources, spec))
     if broken:
@@ -129,11 +125,7 @@ def _checked(
 
 
 def _rendered(jobs: Sequence[ObjectJob], workers: int) -> Generator[tuple[int, Path | UnirenderError], None, None]:
-    """The part of each object, or why there is none, as they are done; the numbers are those of the jobs.
-
-    Raises:
-        UnirenderError: a worker process died.
-    """
+    """The part of each object, or why there is none, as they are done; the numbers are those of the jobs."""
     with WorkerPool(min(workers, max(len(jobs), 1)), start_worker) as pool:
         numbers = {pool.submit(render_object, job): number for number, job in enumerate(jobs)}
         try:
@@ -230,11 +222,6 @@ def pack_truth(spec: SuiteSpec, text: str, parts: Iterable[Path], lights: Mappin
 
 def with_sha256(text: str, path: Path, digest: str) -> str:
     """The text of a suite's TOML file with another hash of its truth; comments and layout stay.
-
-    Args:
-        text: of the file.
-        path: of the file, for the message.
-        digest: the hash.
 
     Raises:
         UnirenderError: there is not exactly one line `sha256 = "..."`.

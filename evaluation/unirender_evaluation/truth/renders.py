@@ -41,12 +41,7 @@ class TruthRenders:
     folder: Path | None = None
 
     def of(self, name: str, make: Callable[[], Arrays]) -> Arrays:
-        """The arrays of a render.
-
-        Args:
-            name: of the render and of all that it depends on.
-            make: renders it.
-        """
+        """The arrays of a render."""
         if self.folder is None:
             return make()
         path = self.folder / f"{hashlib.sha256(name.encode()).hexdigest()[:32]}.npz"
@@ -83,15 +78,10 @@ class TruthRenders:
 
 @dataclass(frozen=True)
 class Again:
-    """Renders of one object, made only where they are not kept yet.
+    """Renders of one object, made only where they are not kept yet."""
 
-    Attributes:
-        renderer: makes its `Renderer`, once.
-        kept: the renders of the whole check.
-    """
-
-    renderer: Callable[[], Any]
-    kept: TruthRenders
+    renderer: Callable[[], Any]  # makes its `Renderer`, once
+    kept: TruthRenders  # the renders of the whole check
 
     def geometry(self, name: str, spp: int, seed: int) -> Intrinsics:
         """Mask, albedo and normal of the object of that name."""

@@ -87,11 +87,7 @@ def _alike(files: Hashes) -> Iterator[tuple[list[str], str]]:
 
 
 def _keep_truth(spec: SuiteSpec, found: Mapping[str, Hashes]) -> None:
-    """Looks whether the truth that is there was made from the same files.
-
-    Raises:
-        UnirenderError: it was not: results on it would be results on nothing that is left.
-    """
+    """Looks whether the truth that is there was made from the same files."""
     if not (spec.truth_sha256 and spec.truth_path.is_file() and spec.path.is_file()):
         return
     try:

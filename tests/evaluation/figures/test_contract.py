@@ -5,17 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from tiny_suites import make_suite
 
 from unirender.camera import Camera
 from unirender_evaluation.figures.command import CONTRACT, KINDS, Figures
 from unirender_evaluation.figures.contract import SAID, ball, camera_figure, maps_figure, png, texel_of
 from unirender_evaluation.suites.suite import Suite
-
-
-@pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    return make_suite(tmp_path_factory.mktemp("contract"))
 
 
 def test_axes_lie_in_the_light_where_the_contract_has_them() -> None:

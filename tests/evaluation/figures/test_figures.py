@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from PIL import Image, ImageFont
-from tiny_suites import SIZE, make_suite
+from tiny_suites import SIZE
 
 from unirender.camera import Camera
 from unirender.command_line.options import ModelOptions
@@ -55,11 +55,6 @@ from unirender_evaluation.suites.suite import MetallicRoughness, Scene, Suite, l
 
 UNEDITED = Subject("unedited", make_row(UneditedInput(), "trivial"))
 ALBEDO = Subject("as albedo", make_row(InputAsAlbedo(), "trivial"))
-
-
-@pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    return make_suite(tmp_path_factory.mktemp("figures"))
 
 
 class StoredTruth:

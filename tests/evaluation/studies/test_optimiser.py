@@ -14,7 +14,7 @@ from multiview_pieces import ball_scene
 from rich.console import Console
 from study_pieces import FEW, SMALL, VERSIONS, full, one_thread, small_study, twin, unrefined
 
-from unirender.errors import UnirenderError, UsageError
+from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.multiview.methods import Optimized, PlainLoop
 from unirender_evaluation.multiview.scoring import score_solution
@@ -93,19 +93,6 @@ def test_small_rates_are_a_quarter_of_every_rate() -> None:
 def test_the_plain_row_is_the_plain_loop_of_the_multi_view_table() -> None:
     plain = next(row for row in ingredients() if row.name == "plain")
     assert plain.config.refine == PlainLoop().settings
-
-
-def test_wrong_names_end_before_anything_is_made(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"--variants colour: expected some of full, .*nvdiffrec, or the groups start"):
-        BenchIngredients(out=tmp_path / "out", variants=("log", "colour")).run()
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("options", [{"objects": 0}, {"seed": -1}])
-def test_wrong_usage_ends_before_anything_is_made(options: dict, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="expected"):
-        BenchIngredients(out=tmp_path / "out", **options).run()
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_file_in_the_place_of_the_folder_is_named(tmp_path: Path) -> None:

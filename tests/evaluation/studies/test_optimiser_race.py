@@ -13,9 +13,8 @@ from PIL import Image
 from rich.console import Console
 from study_pieces import FEW, SMALL, one_thread, small_study
 
-from unirender.errors import UnirenderError, UsageError
+from unirender.errors import UnirenderError
 from unirender_evaluation.multiview.scoring import score_solution
-from unirender_evaluation.studies.optimiser.commands import BenchRace
 from unirender_evaluation.studies.optimiser.curves import Curve, Point, finish, geometric_mean
 from unirender_evaluation.studies.optimiser.race import (
     CURVES,
@@ -183,9 +182,3 @@ def test_the_report_says_what_was_measured(tmp_path: Path) -> None:
     assert (picture == (0xD5, 0x5E, 0x00)).all(axis=-1).any()  # our curve's colour
     (tmp_path / "one.png").write_bytes(draw(races[:1]))
     assert Image.open(tmp_path / "one.png").width < picture.shape[1]
-
-
-def test_wrong_usage_ends_before_anything_is_made(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="expected"):
-        BenchRace(out=tmp_path / "out", objects=0).run()
-    assert not (tmp_path / "out").exists()

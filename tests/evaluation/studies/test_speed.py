@@ -14,9 +14,8 @@ import torch
 from rich.console import Console
 from synthetic_shards import write_dataset
 from tiny_models import SIZE, TRAIN, make_batch, make_model, make_pipeline
-from tiny_suites import make_suite
 
-from unirender.errors import UnirenderError, UsageError
+from unirender.errors import UnirenderError
 from unirender.training.config import RunConfig, TrainConfig
 from unirender.training.loop.trainer import Trainer
 from unirender.training.presets import get_preset
@@ -51,12 +50,6 @@ from unirender_reference.passes import SAMPLES_PER_PASS, pass_count
 
 CPU = torch.device("cpu")
 PLAIN = dataclasses.replace(TRAIN, model=dataclasses.replace(TRAIN.model, physics_prior="none"))
-
-
-@pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    """Two balls of 32 pixels."""
-    return make_suite(tmp_path_factory.mktemp("suite"))
 
 
 @pytest.fixture(scope="module")
@@ -335,23 +328,6 @@ def test_parts_follow_the_data(tmp_path: Path) -> None:
     assert BenchSpeed().check() == ("network", "mitsuba", "start")
     assert BenchSpeed(data=tmp_path).check() == ("network", "mitsuba", "start", "training", "overfit")
     assert BenchSpeed(data=tmp_path, parts=("overfit",)).check() == ("overfit",)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"scenes": 0}, "--scenes 0: expected at least 1"),
-        ({"repeats": 0}, "--repeats 0: expected at least 1"),
-        ({"parts": ("start", "start")}, "--parts start start: expected none of them twice"),
-        ({"parts": ("network", "training")}, "--parts training: expected --data beside it"),
-        ({"preset": "none"}, "preset: got 'none'"),
-        ({"preset": "sd15"}, "--preset sd15: expected one with the pixel codec"),
-    ],
-)
-def test_options_that_cannot_be_right(options: dict[str, Any], message: str, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=message):
-        BenchSpeed(out=tmp_path / "out", **options).run()
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_data_folder_that_is_not_there_is_an_error_before_anything_is_measured(tmp_path: Path) -> None:

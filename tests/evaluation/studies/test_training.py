@@ -8,9 +8,8 @@ import pytest
 from rich.console import Console
 from synthetic_shards import write_dataset
 from tiny_models import SIZE, TRAIN
-from tiny_suites import make_suite
 
-from unirender.errors import UnirenderError, UsageError
+from unirender.errors import UnirenderError
 from unirender.models.config import ModelConfig
 from unirender.training.presets import PRESETS
 from unirender_evaluation.metrics import DEFAULT_VARIANT
@@ -21,6 +20,7 @@ from unirender_evaluation.studies.training.choices import BASE_PRESET, PLAIN, Ch
 from unirender_evaluation.studies.training.command import BenchTraining
 from unirender_evaluation.studies.training.run import TrainingStudy, run
 from unirender_evaluation.studies.training.tables import COLUMNS, cells, table, to_json
+from unirender_evaluation.suites.suite import Suite
 
 ROWS = (
     Choice(PLAIN, "", "Plain model", TRAIN),
@@ -33,9 +33,8 @@ def silent(folder: Path) -> Console:
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> TrainingStudy:
+def study(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> TrainingStudy:
     """Two balls of 32 pixels, groups of the same size, two steps."""
-    suite = make_suite(tmp_path_factory.mktemp("suite"))
     data = write_dataset(tmp_path_factory.mktemp("data"), shards=1, size=SIZE)
     return TrainingStudy(suite, data, tmp_path_factory.mktemp("out"), steps=2, device="cpu", parallel=1)
 
@@ -93,11 +92,6 @@ def test_every_option_reaches_the_study(tmp_path: Path, monkeypatch: pytest.Monk
     assert scenes == evenly(study.suite.scenes, 1)
     assert [(row.name, row.config.seed, row.config.batch_size) for row in rows] == [(PLAIN, 5, 6), ("seed", 6, 6)]
     assert rows[0].config.optimizer == PRESETS["tiny_muon"].optimizer
-
-
-def test_wrong_names_end_before_anything_is_read(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"--choices no-such: expected some of plain, .*, or the groups chance"):
-        BenchTraining(data=tmp_path / "none", choices=("cycle", "no-such")).run()
 
 
 @pytest.mark.long
@@ -161,13 +155,6 @@ def test_the_file_of_one_object_is_strict_json() -> None:
     content = json.loads(to_json(rows, made, {}), parse_constant=pytest.fail)
     cell = content["rows"]["seed"]["cells"][keys[0]]
     assert cell["difference"] == {"mean": 0.0, "low": None, "high": None, "n": 2, "objects": 1}
-
-
-@pytest.mark.parametrize("option", [{"steps": 0}, {"scenes": 0}, {"batch_size": 0}, {"seed": -1}])
-def test_values_out_of_range_are_usage_errors(option: dict[str, int], tmp_path: Path) -> None:
-    name = next(iter(option)).replace("_", "-")
-    with pytest.raises(UsageError, match=f"--{name}"):
-        BenchTraining(data=tmp_path, **option).run()  # pyright: ignore[reportArgumentType] - all are integers
 
 
 def test_missing_data_is_named(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 from rich.console import Console
 from tiny_suites import make_suite
 
-from unirender.errors import UsageError
 from unirender_evaluation.metrics import DEFAULT_VARIANT, metric_key
 from unirender_evaluation.multiview.scenes import multiview_scenes
 from unirender_evaluation.multiview.settings import STANDARD, MultiviewSettings
@@ -141,17 +140,3 @@ def test_aims_are_counted_by_object() -> None:
     assert notes[0] == "Aim: mask IoU >= 0.97: 1 of 2 objects, mean 0.9700."
     assert "2 of 2" in notes[1]
     assert notes[2] == "Aim: seconds <= 600: 1 of 2 objects, mean 350.5."
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"objects": 0}, "--objects 0: expected at least 1"),
-        ({"views": 3}, "--views 3: expected at least 4: fewer silhouettes"),
-        ({"config": OptimizeConfig(texture_size=1)}, "--texture-size 1: expected 4 or more"),
-    ],
-)
-def test_options_that_cannot_be_right(options: dict, message: str, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=message):
-        BenchUnknownMesh(out=tmp_path / "out", **options).run()
-    assert not (tmp_path / "out").exists()

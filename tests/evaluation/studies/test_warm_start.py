@@ -8,17 +8,15 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 from rich.console import Console
-from tiny_suites import make_suite
 
 from unirender.camera import Camera
-from unirender.errors import UsageError
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record
-from unirender_evaluation.studies.warm_start.command import BenchWarmStart
+from unirender_evaluation.studies.cells import difference
 from unirender_evaluation.studies.warm_start.measure import COLD, PICTURE, PREDICTION, WARM, Case, WarmStart, measure
 from unirender_evaluation.studies.warm_start.run import our_method, run
-from unirender_evaluation.studies.warm_start.tables import COLUMNS, block, difference, tables
+from unirender_evaluation.studies.warm_start.tables import COLUMNS, block, tables
 from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.versions import MODEL, MULTIVIEW, OPTIMIZER, REFERENCE, Versions
 from unirender_reference.optimize.single.config import SingleConfig
@@ -46,9 +44,8 @@ class Oracle:
 
 
 @pytest.fixture(scope="module")
-def what(tmp_path_factory: pytest.TempPathFactory) -> WarmStart:
+def what(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> WarmStart:
     """Two balls of 32 pixels; nothing is measured yet."""
-    suite = make_suite(tmp_path_factory.mktemp("suite"))
     return WarmStart(suite, tmp_path_factory.mktemp("warm"), Oracle(suite), QUICK, (GEOMETRY,), VERSIONS)
 
 
@@ -154,9 +151,3 @@ def test_our_method_is_the_row_of_the_benchmark() -> None:
     method = our_method(None)
     assert method.name == "Ours (mean)"
     assert method.config["mode"] == "mean"
-
-
-def test_options_that_cannot_be_right(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="--scenes 0: expected at least 1"):
-        BenchWarmStart(out=tmp_path / "out", scenes=0).run()
-    assert not (tmp_path / "out").exists()

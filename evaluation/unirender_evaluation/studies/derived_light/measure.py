@@ -64,23 +64,14 @@ SURE = metric_key("light_sure", "psnr")  # of the truth: its floor, even if the 
 
 @dataclass(frozen=True)
 class DerivedLight:
-    """What is measured.
+    """What is measured."""
 
-    Attributes:
-        out: folder of the records.
-        lights: names of bundled lights.
-        objects: seeds of procedural objects (training families) beside the sphere.
-        roughness: of s.
-        resolution: of the pictures, pixels.
-        versions: of the code, for the content keys.
-    """
-
-    out: Path
-    lights: tuple[str, ...]
-    objects: tuple[int, ...]
-    roughness: tuple[float, ...]
-    resolution: int
-    versions: Versions
+    out: Path  # folder of the records
+    lights: tuple[str, ...]  # names of bundled lights
+    objects: tuple[int, ...]  # seeds of procedural objects (training families) beside the sphere
+    roughness: tuple[float, ...]  # of s
+    resolution: int  # of the pictures, pixels
+    versions: Versions  # of the code, for the content keys
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.lights) - set(catalogue()))

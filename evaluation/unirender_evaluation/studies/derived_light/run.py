@@ -14,12 +14,7 @@ NAME = "derived_light"
 
 
 def run(what: DerivedLight, console: Console) -> list[Record]:
-    """Measures what is missing and writes `derived_light.md` and `derived_light.json`; returns all records.
-
-    Args:
-        what: the measurement.
-        console: for progress and the table.
-    """
+    """Measures what is missing and writes `derived_light.md` and `derived_light.json`; returns all records."""
     with open_folder(what.out):
         pictures = (1 + len(what.objects)) * len(what.lights)
         total = pictures * sum(len(methods(question)) for question in what.questions)

@@ -13,30 +13,19 @@ from unirender.errors import UnirenderError
 
 @dataclass(frozen=True)
 class Point:
-    """One measure.
+    """One measure."""
 
-    Attributes:
-        iteration: of the descent.
-        seconds: of work until then.
-        psnr: of the albedo, dB.
-    """
-
-    iteration: int
-    seconds: float
-    psnr: float
+    iteration: int  # of the descent
+    seconds: float  # of work until then
+    psnr: float  # of the albedo, dB
 
 
 @dataclass(frozen=True)
 class Curve:
-    """How the albedo got better (or worse).
+    """How the albedo got better (or worse)."""
 
-    Attributes:
-        name: who made it.
-        points: in the order of time.
-    """
-
-    name: str
-    points: tuple[Point, ...]
+    name: str  # who made it
+    points: tuple[Point, ...]  # in the order of time
 
     def __post_init__(self) -> None:
         if not self.points:
@@ -58,23 +47,14 @@ class Curve:
 
 @dataclass(frozen=True)
 class Finish:
-    """The race on one object.
+    """The race on one object."""
 
-    Attributes:
-        target: the best albedo that any plain loop reaches, dB.
-        plain: the loop that is there first.
-        plain_seconds: when.
-        our_seconds: when ours is at least there; None: never.
-        our_end: our last point.
-        plain_then: the best of the plain loops at that time; None: none had been measured.
-    """
-
-    target: float
-    plain: str
-    plain_seconds: float
-    our_seconds: float | None
+    target: float  # the best albedo that any plain loop reaches, dB
+    plain: str  # the loop that is there first
+    plain_seconds: float  # when
+    our_seconds: float | None  # when ours is at least there; None: never
     our_end: Point
-    plain_then: float | None
+    plain_then: float | None  # the best of the plain loops at that time; None: none had been measured
 
     @property
     def ratio(self) -> float:
@@ -83,12 +63,7 @@ class Finish:
 
 
 def finish(ours: Curve, loops: Sequence[Curve]) -> Finish:
-    """The race of one curve against the faster of several plain loops.
-
-    Args:
-        ours: our curve.
-        loops: of the plain loops, without the start.
-    """
+    """The race of one curve against the faster of several plain loops."""
     target = max(loop.best.psnr for loop in loops)
     times = {loop.name: seconds for loop in loops if (seconds := loop.reaches(target)) is not None}
     plain = min(times, key=lambda name: times[name])

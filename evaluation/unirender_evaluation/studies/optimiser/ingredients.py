@@ -28,27 +28,16 @@ NVDIFFREC = {"loss": "log", "white_light": 0.005, "albedo_smoothness": 0.03}
 
 @dataclass(frozen=True)
 class Ingredient:
-    """A row of the study.
+    """A row of the study."""
 
-    Attributes:
-        name: on the command line and in records.
-        group: key of `GROUPS`; empty for the full method.
-        label: what is different.
-        config: of the optimiser.
-    """
-
-    name: str
-    group: str
-    label: str
-    config: OptimizeConfig
+    name: str  # on the command line and in records
+    group: str  # key of `GROUPS`; empty for the full method
+    label: str  # what is different
+    config: OptimizeConfig  # of the optimiser
 
 
 def ingredients(seed: int = 0) -> tuple[Ingredient, ...]:
-    """All rows, the full method first.
-
-    Args:
-        seed: of the optimiser.
-    """
+    """All rows, the full method first."""
     full = OptimizeConfig(seed=seed)
 
     def start(name: str, label: str, **changes: Any) -> Ingredient:

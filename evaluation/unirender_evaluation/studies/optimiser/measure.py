@@ -30,11 +30,7 @@ RECORDS = "records.jsonl"
 
 
 class Starts:
-    """The transport stage's results on one object, each solved once.
-
-    Args:
-        scene: the object.
-    """
+    """The transport stage's results on one object, each solved once."""
 
     def __init__(self, scene: MultiviewScene) -> None:
         self._solved = cache(partial(_solve, scene))
@@ -79,14 +75,7 @@ def rendered_protocol(study: Study) -> tuple[tuple[str, str], ...]:
 
 
 def measure_all(study: Study, rows: Sequence[Ingredient], folder: Path, console: Console) -> list[Record]:
-    """The records of all rows on all objects; those that the folder holds already are read.
-
-    Args:
-        study: the objects.
-        rows: what is measured.
-        folder: of the study, which exists.
-        console: shows how far it is.
-    """
+    """The records of all rows on all objects; those that the folder holds already are read."""
     store = Store.open(folder / RECORDS)
     jobs: dict[str, Callable[[], None]] = {}
     for scene in study.scenes:

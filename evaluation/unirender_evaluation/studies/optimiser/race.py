@@ -34,40 +34,24 @@ CURVES = "curves.jsonl"
 
 @dataclass(frozen=True)
 class RaceSettings:
-    """What runs.
-
-    Attributes:
-        ours: our optimiser.
-        iterations: of the plain loop.
-        losses: of the plain loop, a run each; the one that is first at the best albedo of them all counts.
-        plain_every: iterations of the plain loop between two measures.
-        our_every: iterations of our refinement between two measures.
-    """
+    """What runs; of the plain losses the one counts that is first at the best albedo of them all."""
 
     ours: OptimizeConfig
-    iterations: int = 400
-    losses: tuple[str, ...] = ("srgb", "linear")
-    plain_every: int = 20
-    our_every: int = 5
+    iterations: int = 400  # of the plain loop
+    losses: tuple[str, ...] = ("srgb", "linear")  # of the plain loop, a run each
+    plain_every: int = 20  # iterations of the plain loop between two measures
+    our_every: int = 5  # iterations of our refinement between two measures
 
 
 @dataclass(frozen=True)
 class ObjectRace:
-    """The curves of one object.
+    """The curves of one object."""
 
-    Attributes:
-        key: content key.
-        object: its name.
-        start: albedo of the grey start, dB.
-        ours: our curve; its first point is the transport stage's result.
-        loops: of the plain loops.
-    """
-
-    key: str
-    object: str
-    start: float
-    ours: Curve
-    loops: tuple[Curve, ...]
+    key: str  # content key
+    object: str  # its name
+    start: float  # albedo of the grey start, dB
+    ours: Curve  # its first point is the transport stage's result
+    loops: tuple[Curve, ...]  # of the plain loops
 
     def to_json(self) -> str:
         """One line of JSON."""
@@ -121,17 +105,7 @@ def descend(
     every: int,
     first: Sequence[Point] = (),
 ) -> tuple[Curve, Solution]:
-    """Runs a refinement and measures it as it goes.
-
-    Args:
-        name: of the curve.
-        scene: the object.
-        watch: the clock.
-        start: where it begins.
-        config: of the refinement.
-        every: iterations between two measures; the end is measured, too.
-        first: points that were measured before.
-    """
+    """Runs a refinement and measures it every so many iterations, and at its end; `first` was measured before."""
     from unirender_reference.optimize.refine.run import refine
     from unirender_reference.optimize.refine.state import RefineState
 
@@ -219,11 +193,7 @@ def run_race(scene: MultiviewScene, settings: RaceSettings, key: str, name: str)
 
 
 def read_curves(path: Path) -> list[ObjectRace]:
-    """What earlier runs stored; half a line at the end, left by a killed run, is cut off.
-
-    Raises:
-        UnirenderError: a line is none of a race.
-    """
+    """What earlier runs stored; half a line at the end, left by a killed run, is cut off."""
     text = path.read_text(encoding="utf-8") if path.exists() else ""
     complete = text[: text.rfind("\n") + 1]
     if complete != text:

@@ -30,21 +30,13 @@ USES = frozenset({MULTIVIEW, OPTIMIZER, REFERENCE})
 
 @dataclass(frozen=True)
 class Study:
-    """The objects of a study.
-
-    Attributes:
-        suite: the suite.
-        scenes: one for each object.
-        settings: cameras and samples.
-        code: versions of what its figures depend on.
-        seed: of what is compared.
-    """
+    """The objects of a study."""
 
     suite: Suite
-    scenes: tuple[Scene, ...]
-    settings: MultiviewSettings
-    code: str
-    seed: int
+    scenes: tuple[Scene, ...]  # one for each object
+    settings: MultiviewSettings  # cameras and samples
+    code: str  # versions of what its figures depend on
+    seed: int  # of what is compared
 
     @classmethod
     def of(
@@ -58,16 +50,8 @@ class Study:
     ) -> "Study":
         """The study of a suite's first scenes of `objects` objects, as the multi-view table has them.
 
-        Args:
-            suite: a bundled suite, or the path of a suite's TOML file.
-            objects: how many, evenly spaced.
-            seed: of what is compared.
-            own: the module that measures, part of the code's version.
-            settings: cameras and samples.
-            found: versions of the code; None: of what is installed.
-
-        Raises:
-            UnirenderError: no such suite, or its truth was changed.
+        `own` is the module that measures, part of the code's version; `found`: versions of the code, if not those
+        installed.
         """
         loaded = load_suite(suite)
         code = (found or versions()).of(USES) + f"{SEPARATOR}{own} {modules_version(own)}"

@@ -6,12 +6,11 @@ from itertools import groupby
 
 from rich.console import Console
 
-from unirender_evaluation.comparisons import values_of
 from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE
 from unirender_evaluation.records import Record
-from unirender_evaluation.statistics import CONFIDENCE, METHOD, paired_difference, unprinted_note
-from unirender_evaluation.studies.cells import Cell, as_json, cell_text
+from unirender_evaluation.statistics import CONFIDENCE, METHOD, unprinted_note
+from unirender_evaluation.studies.cells import Cell, as_json, cell_text, row_cells
 from unirender_evaluation.studies.optimiser.ingredients import FULL, GROUPS, Ingredient, changes
 from unirender_evaluation.tables.formats import header, json_text
 from unirender_evaluation.tables.protocol import protocol_text
@@ -44,25 +43,8 @@ class Line:
 
 
 def summarise(rows: Sequence[Ingredient], records: Sequence[Record]) -> list[Line]:
-    """The lines of the table, from records of all rows.
-
-    Args:
-        rows: the full method among them.
-        records: of these rows.
-
-    Raises:
-        UnirenderError: a row has no record in common with the full method, or a difference is infinite.
-    """
-    lines = []
-    for row in rows:
-        cells = []
-        for column in columns():
-            key = column.key(DEFAULT_VARIANT)
-            own, full = values_of(records, row.name, key), values_of(records, FULL, key)
-            mean = sum(own.values()) / len(own)
-            cells.append(Cell(mean, len(own), None if row.name == FULL else paired_difference(own, full)))
-        lines.append(Line(row, tuple(cells)))
-    return lines
+    """The lines of the table, from records of all rows."""
+    return [Line(row, row_cells(records, row.name, FULL, columns())) for row in rows]
 
 
 def settings_text(row: Ingredient, full: Ingredient) -> str:
@@ -74,13 +56,7 @@ def settings_text(row: Ingredient, full: Ingredient) -> str:
 
 
 def tables(lines: Sequence[Line], settings: bool, shown: slice = EVERY) -> list[TextTable]:
-    """A table for each group, the full method first in each.
-
-    Args:
-        lines: the full method among them.
-        settings: whether to show what of the configuration is different, as Markdown.
-        shown: which of the columns.
-    """
+    """A table for each group, the full method first in each; `settings` shows what is configured otherwise."""
     full = next(line for line in lines if line.row.name == FULL)
     titles = [f"{column.group} {header(column)}" for column in columns()[shown]]
 

@@ -41,40 +41,24 @@ LOW_OCTAVE, HIGH_OCTAVE = -12, 3  # spreads below 2^-12 count in the first bin, 
 
 @dataclass(frozen=True)
 class Bin:
-    """Pixels whose spread lies in [2^octave, 2^(octave + 1)).
+    """Pixels whose spread lies in [2^octave, 2^(octave + 1))."""
 
-    Attributes:
-        octave: of the spread.
-        weight: sum of the pixels' weights, as a share of the scene's.
-        squared_error: weighted sum of (m - y)^2.
-        variance: weighted sum of (1 + 1/N) s^2: what the squared error should be.
-    """
-
-    octave: int
-    weight: float
-    squared_error: float
-    variance: float
+    octave: int  # of the spread
+    weight: float  # sum of the pixels' weights, as a share of the scene's
+    squared_error: float  # weighted sum of (m - y)^2
+    variance: float  # weighted sum of (1 + 1/N) s^2: what the squared error should be
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """One map of one scene.
+    """One map of one scene."""
 
-    Attributes:
-        squared_error: E_w (m - y)^2.
-        variance: E_w s^2.
-        expected: (1 + 1/N) E_w s^2.
-        coverage: of the interval.
-        rank: between pixels; None where spread or error is the same everywhere.
-        bins: those that have pixels.
-    """
-
-    squared_error: float
-    variance: float
-    expected: float
-    coverage: float
-    rank: float | None
-    bins: tuple[Bin, ...]
+    squared_error: float  # E_w (m - y)^2
+    variance: float  # E_w s^2
+    expected: float  # (1 + 1/N) E_w s^2
+    coverage: float  # of the interval
+    rank: float | None  # between pixels; None where spread or error is the same everywhere
+    bins: tuple[Bin, ...]  # those that have pixels
 
     def values(self, name: str) -> dict[str, float]:
         """As a record's values."""
@@ -102,21 +86,13 @@ class Calibration:
 
 @dataclass(frozen=True)
 class Pooled:
-    """One map over several scenes, all of which count alike.
+    """One map over several scenes, all of which count alike."""
 
-    Attributes:
-        rms_error: of the mean.
-        rms_spread: root of the mean s^2.
-        ratio: see the module; infinite without spread.
-        rank_scenes: None with fewer than three scenes.
-        bins: weights and sums added up.
-    """
-
-    rms_error: float
-    rms_spread: float
-    ratio: float
-    rank_scenes: float | None
-    bins: tuple[Bin, ...]
+    rms_error: float  # of the mean
+    rms_spread: float  # root of the mean s^2
+    ratio: float  # see the module; infinite without spread
+    rank_scenes: float | None  # None with fewer than three scenes
+    bins: tuple[Bin, ...]  # weights and sums added up
 
 
 def calibrate(
@@ -182,12 +158,7 @@ def pool(found: Sequence[Calibration]) -> Pooled:
 
 
 def scene_calibration(samples: Sequence[Intrinsics], truth: Intrinsics) -> dict[str, Calibration]:
-    """Every map that samples and truth have, of one scene.
-
-    Args:
-        samples: at least two decompositions of one picture.
-        truth: with its mask.
-    """
+    """Every map that samples and truth have, of one scene."""
     found = {}
     for name in MAPS:
         target = getattr(truth, name)

@@ -37,11 +37,7 @@ class BenchSampling:
     """Where the model runs. auto: cuda, then mps, then cpu, whichever is there."""
 
     def check(self) -> None:
-        """Looks at the values.
-
-        Raises:
-            UsageError: one is outside its range.
-        """
+        """Looks at the values; `UsageError` where one is outside its range."""
         at_least(1, scenes=self.scenes)
         at_least(0, seed=self.seed)
         for name, most in (("steps", MOST_STEPS), ("samples", None)):

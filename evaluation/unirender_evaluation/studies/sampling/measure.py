@@ -33,17 +33,11 @@ OWN_MODULES = ("studies/sampling/measure", "studies/sampling/calibration")
 
 @dataclass(frozen=True)
 class Setting:
-    """How the network is asked.
+    """How the network is asked."""
 
-    Attributes:
-        mode: `mean` or `sample`.
-        steps: of the sampler.
-        samples: whose mean is scored.
-    """
-
-    mode: str
-    steps: int = 1
-    samples: int = 1
+    mode: str  # `mean` or `sample`
+    steps: int = 1  # of the sampler
+    samples: int = 1  # whose mean is scored
 
     @property
     def key(self) -> str:
@@ -56,31 +50,18 @@ MEAN = Setting("mean")
 
 @dataclass(frozen=True)
 class SamplingStudy:
-    """What is measured.
+    """What is measured."""
 
-    Attributes:
-        suite: whose scenes.
-        out: folder of the records.
-        pipeline: a `UniRenderPipeline`, or what loads one when it is asked.
-        weights: sha256 of its checkpoint.
-        device: where it runs.
-        steps: of mode `sample`, in rising order.
-        samples: the same.
-        sampler: of mode `sample`: `ddim` or `unipc`.
-        seed: of the noise; every scene derives its own.
-        versions: of the code, for the content keys.
-    """
-
-    suite: Suite
-    out: Path
-    pipeline: Any
-    weights: str
-    device: str
-    steps: tuple[int, ...]
-    samples: tuple[int, ...]
-    sampler: str
-    seed: int
-    versions: Versions
+    suite: Suite  # whose scenes
+    out: Path  # folder of the records
+    pipeline: Any  # a `UniRenderPipeline`, or what loads one when it is asked
+    weights: str  # sha256 of its checkpoint
+    device: str  # where it runs
+    steps: tuple[int, ...]  # of mode `sample`, in rising order
+    samples: tuple[int, ...]  # the same
+    sampler: str  # of mode `sample`: `ddim` or `unipc`
+    seed: int  # of the noise; every scene derives its own
+    versions: Versions  # of the code, for the content keys
 
     @property
     def settings(self) -> tuple[Setting, ...]:

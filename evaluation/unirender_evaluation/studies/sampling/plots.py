@@ -5,10 +5,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from unirender_evaluation.comparisons import values_of
-from unirender_evaluation.metrics import DEFAULT_VARIANT
 from unirender_evaluation.records import Record
-from unirender_evaluation.statistics import Estimate, paired_difference
+from unirender_evaluation.studies.cells import difference
 from unirender_evaluation.studies.sampling.calibration import MAPS, Calibration, pool
 from unirender_evaluation.studies.sampling.measure import MEAN, Setting
 from unirender_evaluation.studies.sampling.tables import COLUMNS, calibrations
@@ -48,7 +46,7 @@ def _steps_panel(axes: Any, records: Sequence[Record], settings: Sequence[Settin
     sampled = [setting for setting in settings if setting != MEAN]
     counts = sorted({setting.samples for setting in sampled})
     for index, count in enumerate(counts):
-        own = [(s.steps, from_mean(records, s, column)) for s in sampled if s.samples == count]
+        own = [(s.steps, difference(records, s.key, MEAN.key, column)) for s in sampled if s.samples == count]
         points = [(steps, found) for steps, found in own if found is not None]
         if not points:
             continue
@@ -71,16 +69,6 @@ def _steps_panel(axes: Any, records: Sequence[Record], settings: Sequence[Settin
     axes.set_xlabel("steps")
     axes.set_title(column.group, fontsize=10)
     axes.grid(alpha=0.2)
-
-
-def from_mean(records: Sequence[Record], setting: Setting, column: Column) -> Estimate | None:
-    """Paired difference from mode `mean`; None where the two share no picture, or one's score is infinite."""
-    key = column.key(DEFAULT_VARIANT)
-    own, level = (values_of(records, name, key) for name in (setting.key, MEAN.key))
-    shared = own.keys() & level.keys()
-    if not shared or not all(math.isfinite(values[sample]) for values in (own, level) for sample in shared):
-        return None
-    return paired_difference(own, level, {record.sample: record.object for record in records})
 
 
 def draw_reliability(records: Sequence[Record], setting: Setting) -> bytes:

@@ -20,13 +20,7 @@ STEPS_PLOT, RELIABILITY_PLOT = "sampling.png", "calibration.png"
 
 
 def run(what: SamplingStudy, scenes: Sequence[Scene], console: Console) -> list[Record]:
-    """Measures what is missing and writes `sampling.md`, `.json`, `.png` and `calibration.png`.
-
-    Args:
-        what: the measurement.
-        scenes: at least one.
-        console: for progress and tables.
-    """
+    """Measures what is missing and writes `sampling.md`, `.json`, `.png` and `calibration.png`."""
     with open_folder(what.out):
         total = len(scenes) * len(what.settings) * len(PROTOCOLS)
         records, computed = collect(measure(what, scenes), total, "sampling", console)

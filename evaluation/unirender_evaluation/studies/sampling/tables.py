@@ -5,9 +5,10 @@ from dataclasses import asdict
 from typing import Any
 
 from unirender_evaluation.metrics import DEFAULT_VARIANT
+from unirender_evaluation.multiview.tables import plain_column
 from unirender_evaluation.records import Record
-from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, unprinted_note
-from unirender_evaluation.studies.cells import as_json, study_column
+from unirender_evaluation.statistics import INTERVAL, Estimate, unprinted_note
+from unirender_evaluation.studies.cells import as_json, estimate
 from unirender_evaluation.studies.sampling.calibration import CONFIDENCE, MAPS, Calibration, Pooled, pool
 from unirender_evaluation.studies.sampling.measure import DECOMPOSE, MEAN, RENDER, Setting
 from unirender_evaluation.tables.formats import MISSING, estimate_text, format_number, header, json_number, json_text
@@ -20,11 +21,11 @@ Protocol = Sequence[tuple[str, str]]
 
 
 COLUMNS = (
-    study_column("albedo", "albedo", "psnr"),
-    study_column("normal", "normal", "cosine"),
-    study_column("roughness", "roughness", "mse"),
-    study_column("metallic", "metallic", "mse"),
-    study_column("render", RENDER, "psnr"),
+    plain_column("albedo", "albedo", "psnr"),
+    plain_column("normal", "normal", "cosine"),
+    plain_column("roughness", "roughness", "mse"),
+    plain_column("metallic", "metallic", "mse"),
+    plain_column("render", RENDER, "psnr"),
 )
 QUALITY_NOTE = (
     "Albedo, normal, roughness, metallic: `decompose` of the picture, the network's own maps (not closed). Render: "
@@ -42,12 +43,6 @@ UNITS_NOTE = (
     "Albedo, specular and diffuse as display values (clipped, sRGB), normals by component, environment as ln(x + 0.01) "
     "weighted by solid angle, the others by coverage. n: scenes; the suite has s for some materials only."
 )
-
-
-def estimate(records: Sequence[Record], method: str, key: str) -> Estimate | None:
-    """The mean of one value over the records of a setting; None where none has it."""
-    own = [record for record in records if record.method == method and key in record.values]
-    return mean_estimate([r.values[key] for r in own], [r.object for r in own]) if own else None
 
 
 def calibrations(records: Sequence[Record], setting: Setting, name: str) -> list[Calibration]:

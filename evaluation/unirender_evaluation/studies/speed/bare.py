@@ -27,17 +27,11 @@ LAST = NUM_TIMESTEPS - 1
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of one of the parts that run side by side.
+    """Rows of one of the parts that run side by side."""
 
-    Attributes:
-        render: rows that render; they come first.
-        inverse: rows of inverse rendering.
-        cycle: of these, rows that are rendered again.
-    """
-
-    render: int
-    inverse: int
-    cycle: int
+    render: int  # rows that render; they come first
+    inverse: int  # rows of inverse rendering
+    cycle: int  # of these, rows that are rendered again
 
 
 @dataclass(frozen=True)
@@ -73,15 +67,7 @@ def cut_batch(config: TrainConfig, parallel: int) -> list[Rows]:
 
 
 class BarePasses:
-    """Runs the passes of a batch when it is called.
-
-    Args:
-        model: the network.
-        conditioning: of it; gives the shapes.
-        config: batch and loss.
-        parallel: parts side by side.
-        dtype: of the autocast; float32: none.
-    """
+    """Runs the passes of a batch when it is called."""
 
     def __init__(
         self, model: DualStreamModel, conditioning: Conditioning, config: TrainConfig, parallel: int, dtype: torch.dtype

@@ -26,19 +26,12 @@ NOTE = (
 
 @dataclass(frozen=True)
 class NetworkTime:
-    """One action.
+    """One action."""
 
-    Attributes:
-        what: `DECOMPOSE`, `CLOSED` or `RENDER`.
-        steps: of the sampler.
-        batch: samples in one call.
-        timing: of the call.
-    """
-
-    what: str
-    steps: int
-    batch: int
-    timing: Timing
+    what: str  # `DECOMPOSE`, `CLOSED` or `RENDER`
+    steps: int  # of the sampler
+    batch: int  # samples in one call
+    timing: Timing  # of the call
 
     @property
     def milliseconds(self) -> float:

@@ -81,11 +81,7 @@ class FixedSource:
 
 
 def one_pair(data: Path, size: int) -> Maps:
-    """The first pair of the shards as a batch of one, not augmented.
-
-    Raises:
-        UnirenderError: unusable shards, or pictures of another size.
-    """
+    """The first pair of the shards as a batch of one, not augmented."""
     from unirender.training.augmentations.augment import NO_AUGMENTATION
     from unirender.training.data.dataset import make_batch
     from unirender.training.data.source import ShardSource

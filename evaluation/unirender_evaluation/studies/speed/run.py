@@ -19,14 +19,7 @@ Measures = dict[PartName, Callable[[], Part]]
 def run(
     out: Path, measures: Mapping[PartName, Callable[[], Part]], protocol: Sequence[tuple[str, str]], console: Console
 ) -> list[Part]:
-    """Measures the parts in turn; writes `speed.md` and `speed.json` anew after each, so that a late failure costs one.
-
-    Args:
-        out: folder to write to.
-        measures: what measures each part.
-        protocol: (what, value) pairs.
-        console: for progress and tables.
-    """
+    """Measures the parts in turn; writes `speed.md` and `.json` anew after each, so that a late failure costs one."""
     with open_folder(out):
         parts: list[Part] = []
         for name, measure in measures.items():

@@ -77,15 +77,7 @@ with open(report, "w") as file:
 def cold_starts(
     suite: Suite, scene: Scene, checkpoint: Path | None, options: Sequence[str], turns: int
 ) -> list[dict[str, float]]:
-    """Seconds of each kind of process, a dict a turn: `torch`, `command`, and the entries of `SPLIT` and `interpreter`.
-
-    Args:
-        suite: of the scene.
-        scene: whose picture is decomposed.
-        checkpoint: folder of the model; None: the shipped one.
-        options: further options of `decompose`.
-        turns: that count.
-    """
+    """Seconds of each kind of process, a dict a turn: `torch`, `command`, the entries of `SPLIT`, `interpreter`."""
     from unirender.shipped import checkpoint_folder
     from unirender.visualization import write_png
 
@@ -112,11 +104,7 @@ def cold_starts(
 
 
 def run_process(arguments: Sequence[str], folder: Path) -> float:
-    """Wall clock in seconds of Python with these arguments.
-
-    Raises:
-        UnirenderError: it fails.
-    """
+    """Wall clock in seconds of Python with these arguments."""
     start = time.perf_counter()
     done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     seconds = time.perf_counter() - start

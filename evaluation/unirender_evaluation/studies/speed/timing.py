@@ -22,17 +22,11 @@ from unirender_evaluation.tables.text import TextTable
 
 @dataclass(frozen=True)
 class Part:
-    """What a part found.
+    """What a part found."""
 
-    Attributes:
-        name: which.
-        tables: to print.
-        data: the same in full, for JSON.
-    """
-
-    name: PartName
-    tables: tuple[TextTable, ...]
-    data: dict[str, Any]
+    name: PartName  # which
+    tables: tuple[TextTable, ...]  # to print
+    data: dict[str, Any]  # the same in full, for JSON
 
 
 @dataclass(frozen=True)

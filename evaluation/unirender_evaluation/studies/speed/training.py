@@ -27,19 +27,7 @@ NEVER = 10**9  # steps: the run has no end, its learning rate does not decay
 def throughput(
     data: Path, config: TrainConfig, device: Any, dtype: Any, steps: int, turns: int
 ) -> tuple[list[dict[str, float]], int]:
-    """Samples/s of both, a dict a turn with `trained`, `bare` and their `ratio`; and how many parts ran side by side.
-
-    Args:
-        data: folder of shards.
-        config: the preset.
-        device: to train on.
-        dtype: of the autocast.
-        steps: of a block.
-        turns: that count.
-
-    Raises:
-        UnirenderError: unusable shards, or pictures of another size than the preset's.
-    """
+    """Samples/s, a dict a turn with `trained`, `bare` and their `ratio`; and how many parts ran side by side."""
     from unirender.training.config import RunConfig
     from unirender.training.data.source import ShardSource
     from unirender.training.loop.export import averaged_pipeline

@@ -28,28 +28,16 @@ QUESTIONS = {
 
 @dataclass(frozen=True)
 class Choice:
-    """A row of the study.
+    """A row of the study."""
 
-    Attributes:
-        name: on the command line and in records.
-        group: the question that it answers, key of `QUESTIONS`; empty for the plain model.
-        label: what is different.
-        config: of the training.
-    """
-
-    name: str
-    group: str
-    label: str
-    config: TrainConfig
+    name: str  # on the command line and in records
+    group: str  # the question that it answers, key of `QUESTIONS`; empty for the plain model
+    label: str  # what is different
+    config: TrainConfig  # of the training
 
 
 def training_choices(seed: int = 0, batch_size: int | None = None, preset: str = BASE_PRESET) -> tuple[Choice, ...]:
     """All rows, the one that the others are changes of first; without those that another row is already.
-
-    Args:
-        seed: of weights, data order and noise.
-        batch_size: instead of the preset's.
-        preset: what every row begins with.
 
     Raises:
         UnirenderError: no such preset.

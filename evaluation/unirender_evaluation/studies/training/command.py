@@ -45,11 +45,7 @@ class BenchTraining:
     """Seed of weights, data order and noise."""
 
     def check(self) -> None:
-        """Looks at the values.
-
-        Raises:
-            UsageError: one is outside its range.
-        """
+        """Looks at the values; `UsageError` where one is outside its range."""
         at_least(1, scenes=self.scenes, steps=self.steps, batch_size=self.batch_size, parallel=self.parallel)
         at_least(0, seed=self.seed)
 
@@ -77,11 +73,7 @@ class BenchTraining:
         return 0
 
     def _possible(self, rows: "Sequence[Choice]") -> "tuple[Choice, ...]":
-        """The rows that can be trained on the data; says which are left out.
-
-        Raises:
-            UnirenderError: one of those asked for by name cannot.
-        """
+        """The rows that can be trained on the data; says which are left out."""
         from unirender.training.data.contrasts import ContrastDataset
 
         possible = []

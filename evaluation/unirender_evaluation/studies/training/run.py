@@ -45,25 +45,15 @@ OWN, MITSUBA = "again", "again_mitsuba"  # quantities: the unclosed maps, render
 
 @dataclass(frozen=True)
 class TrainingStudy:
-    """What is measured, but for the rows.
+    """What is measured, but for the rows."""
 
-    Attributes:
-        suite: whose scenes.
-        data: folder of the training samples.
-        out: folder of records, tables and training runs.
-        steps: of every training.
-        device: where the training runs.
-        parallel: passes side by side; None: as many as PyTorch has threads.
-        preset: what every row is a change of, for the description.
-    """
-
-    suite: Suite
-    data: Path
-    out: Path
-    steps: int
-    device: Device = "auto"
-    parallel: int | None = None
-    preset: str = BASE_PRESET
+    suite: Suite  # whose scenes
+    data: Path  # folder of the training samples
+    out: Path  # folder of records, tables and training runs
+    steps: int  # of every training
+    device: Device = "auto"  # where the training runs
+    parallel: int | None = None  # passes side by side; None: as many as PyTorch has threads
+    preset: str = BASE_PRESET  # what every row is a change of, for the description
 
     @cached_property
     def trained_on(self) -> dict[str, Any]:
@@ -153,14 +143,7 @@ def measure(study: TrainingStudy, rows: Sequence[Choice], scenes: Sequence[Scene
 
 
 def run(study: TrainingStudy, rows: Sequence[Choice], scenes: Sequence[Scene], console: Console) -> list[Record]:
-    """Trains and measures what is missing and writes `training.md` and `training.json`.
-
-    Args:
-        study: the measurement.
-        rows: the plain model among them.
-        scenes: at least one.
-        console: for progress and tables.
-    """
+    """Trains and measures what is missing and writes `training.md` and `training.json`."""
     with open_folder(study.out):
         records, computed = [], 0
         for record, new in measure(study, rows, scenes):

@@ -6,24 +6,24 @@ from dataclasses import asdict
 from itertools import groupby
 from typing import Any
 
-from unirender_evaluation.comparisons import values_of
 from unirender_evaluation.metrics import DEFAULT_VARIANT
+from unirender_evaluation.multiview.tables import plain_column
 from unirender_evaluation.records import Record
-from unirender_evaluation.statistics import INTERVAL, paired_difference, unprinted_note
-from unirender_evaluation.studies.cells import Cell, as_json, cell_text, study_column
+from unirender_evaluation.statistics import INTERVAL, unprinted_note
+from unirender_evaluation.studies.cells import Cell, as_json, cell_text, row_cells
 from unirender_evaluation.studies.training.choices import PLAIN, QUESTIONS, Choice
 from unirender_evaluation.tables.formats import header, json_text
 from unirender_evaluation.tables.text import TextTable
 
 COLUMNS = (
-    study_column("albedo", "albedo", "psnr"),
-    study_column("normal", "normal", "cosine"),
-    study_column("roughness", "roughness", "mse"),
-    study_column("metallic", "metallic", "mse"),
-    study_column("render of true maps", "render", "psnr"),
-    study_column("edit", "edit", "psnr"),
-    study_column("own maps, own render", "again", "psnr"),
-    study_column("own maps, Mitsuba", "again_mitsuba", "psnr"),
+    plain_column("albedo", "albedo", "psnr"),
+    plain_column("normal", "normal", "cosine"),
+    plain_column("roughness", "roughness", "mse"),
+    plain_column("metallic", "metallic", "mse"),
+    plain_column("render of true maps", "render", "psnr"),
+    plain_column("edit", "edit", "psnr"),
+    plain_column("own maps, own render", "again", "psnr"),
+    plain_column("own maps, Mitsuba", "again_mitsuba", "psnr"),
 )
 NOTE = (
     f"Mean over scenes; in brackets the paired difference from the first row, ± half of its "
@@ -36,14 +36,7 @@ NOTE = (
 
 def cells(records: Sequence[Record], method: str) -> tuple[Cell, ...]:
     """The cells of a row in the order of `COLUMNS`."""
-    clusters = {record.sample: record.object for record in records}
-    found = []
-    for column in COLUMNS:
-        key = column.key(DEFAULT_VARIANT)
-        own, plain = values_of(records, method, key), values_of(records, PLAIN, key)
-        difference = None if method == PLAIN else paired_difference(own, plain, clusters)
-        found.append(Cell(sum(own.values()) / len(own), len(own), difference))
-    return tuple(found)
+    return row_cells(records, method, PLAIN, COLUMNS)
 
 
 def table(rows: Sequence[Choice], records: Sequence[Record]) -> TextTable:

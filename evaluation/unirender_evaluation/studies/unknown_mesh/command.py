@@ -35,11 +35,7 @@ class BenchUnknownMesh:
     config: Annotated[OptimizeConfig, tyro.conf.arg(name="")] = field(default_factory=OptimizeConfig)
 
     def check(self) -> None:
-        """Looks at the values.
-
-        Raises:
-            UsageError: one is outside its range.
-        """
+        """Looks at the values; `UsageError` where one is outside its range."""
         at_least(1, objects=self.objects)
         if self.views < LEAST_VIEWS:
             raise UsageError(

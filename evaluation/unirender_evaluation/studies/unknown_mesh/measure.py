@@ -31,21 +31,13 @@ DIGITS = 8  # of the content key, in a folder's name
 
 @dataclass(frozen=True)
 class UnknownMesh:
-    """What is measured.
+    """What is measured."""
 
-    Attributes:
-        suite: whose objects and lights.
-        out: folder of records and results.
-        settings: cameras and samples.
-        config: of the optimisation.
-        versions: of the code, for the content keys.
-    """
-
-    suite: Suite
-    out: Path
-    settings: MultiviewSettings
-    config: OptimizeConfig
-    versions: Versions
+    suite: Suite  # whose objects and lights
+    out: Path  # folder of records and results
+    settings: MultiviewSettings  # cameras and samples
+    config: OptimizeConfig  # of the optimisation
+    versions: Versions  # of the code, for the content keys
 
     @property
     def code(self) -> str:
@@ -67,13 +59,7 @@ class UnknownMesh:
 def measure(
     what: UnknownMesh, scenes: Sequence[Scene], progress: Callable[[Scene], OnReport | None] = lambda scene: None
 ) -> Iterator[tuple[Record, bool]]:
-    """The records of scenes, and whether each was measured now; those that are stored are not measured again.
-
-    Args:
-        what: the measurement.
-        scenes: of the suite.
-        progress: for a scene, what hears of every step.
-    """
+    """The records of scenes, and whether each was measured now; those that are stored are not measured again."""
     store = Store.open(what.out / "records.jsonl")
     for scene in scenes:
         key = what.key(scene)

@@ -15,12 +15,7 @@ MAPS = ("albedo", "normal", "roughness", "metallic")
 
 
 def found_strip(scene: MultiviewScene, looks: Looks) -> Image.Image:
-    """Two lines for each of the first held-out cameras: what was found, and below it the truth, over white.
-
-    Args:
-        scene: with its truth.
-        looks: of what was found.
-    """
+    """Two lines for each of the first held-out cameras: what was found, and below it the truth, over white."""
     count = min(CAMERAS, len(scene.held_out_poses))
     ours, true = ([camera_panels(scene, one, camera) for camera in range(count)] for one in (looks, true_looks(scene)))
     lines = []

@@ -20,14 +20,7 @@ NAME = "unknown_mesh"
 
 
 def run(what: UnknownMesh, scenes: Sequence[Scene], console: Console, progress: bool = True) -> list[Record]:
-    """Measures what is missing and writes `unknown_mesh.md` and `unknown_mesh.json`.
-
-    Args:
-        what: the measurement.
-        scenes: at least one.
-        console: for progress and tables.
-        progress: show where an optimisation stands.
-    """
+    """Measures what is missing and writes `unknown_mesh.md` and `unknown_mesh.json`."""
     names = {scene.key: scene_name(scene, scene_material(what.suite, scene)) for scene in scenes}
     with open_folder(what.out):
         records, computed = [], 0

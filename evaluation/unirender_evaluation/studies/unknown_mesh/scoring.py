@@ -47,13 +47,7 @@ CHAMFER = Metric(
 
 
 def score_found(scene: MultiviewScene, solution: Solution, looks: Looks | None = None) -> dict[str, float]:
-    """Metric key -> value of a result with a mesh of its own.
-
-    Args:
-        scene: with its truth.
-        solution: the object that was found, in the scene's world, and its light.
-        looks: `solution_looks` of it, if it is there already.
-    """
+    """Metric key -> value of a result with a mesh of its own."""
     looks = solution_looks(scene, solution) if looks is None else looks
     values = score_maps(looks.buffers.replace(normal=None), scene.buffers)
     values = {key: value for key, value in values.items() if not any(name in key for name in NEIGHBOURS)}

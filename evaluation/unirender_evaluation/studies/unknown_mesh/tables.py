@@ -53,13 +53,7 @@ AIMS = (
 
 
 def tables(records: Sequence[Record], names: Mapping[str, str], settings: MultiviewSettings) -> list[TextTable]:
-    """Shape, looks and seconds.
-
-    Args:
-        records: one for each object, at least one.
-        names: what each sample is called.
-        settings: cameras and samples.
-    """
+    """Shape, looks and seconds."""
     stages = [key.split(".")[0].removeprefix("time_") for key in records[-1].values if key.startswith("time_")]
     times = (*(Column(stage, f"time_{stage}", SECONDS) for stage in stages), Column("all", "time", SECONDS))
     given = f"{settings.seen} views, no mesh"

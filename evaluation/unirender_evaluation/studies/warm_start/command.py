@@ -30,11 +30,7 @@ class BenchWarmStart:
     """Of the optimisation, cold and warm."""
 
     def check(self) -> None:
-        """Looks at the values.
-
-        Raises:
-            UsageError: one is outside its range.
-        """
+        """Looks at the values; `UsageError` where one is outside its range."""
         at_least(1, scenes=self.scenes)
 
     def run(self) -> int:

@@ -50,23 +50,14 @@ STEPS = Metric(
 
 @dataclass(frozen=True)
 class WarmStart:
-    """What is measured.
+    """What is measured."""
 
-    Attributes:
-        suite: whose scenes.
-        out: folder of the records.
-        base: a method with `decompose`: the prediction.
-        config: of the optimisation, cold and warm.
-        geometries: those that are given.
-        versions: of the code, for the content keys.
-    """
-
-    suite: Suite
-    out: Path
-    base: Any
-    config: SingleConfig
-    geometries: tuple[Geometry, ...]
-    versions: Versions
+    suite: Suite  # whose scenes
+    out: Path  # folder of the records
+    base: Any  # a method with `decompose`: the prediction
+    config: SingleConfig  # of the optimisation, cold and warm
+    geometries: tuple[Geometry, ...]  # those that are given
+    versions: Versions  # of the code, for the content keys
 
     def questions(self) -> Iterator[tuple[str, str]]:
         """(protocol, method) of every record of a scene."""
@@ -143,12 +134,7 @@ class Case:
         return options
 
     def scores(self, found: Intrinsics, geometry: Any) -> dict[str, float]:
-        """Maps, light, and the renders under both lights.
-
-        Args:
-            found: maps and light.
-            geometry: the mesh, whose shadows are in the renders; None: without shadows.
-        """
+        """Maps, light, and the renders under both lights, with the shadows of a mesh (`geometry`) or without."""
         from unirender_reference.shade import shade
 
         mask, camera = self._seen["mask"], self._seen["camera"]

@@ -18,11 +18,7 @@ NAME = "warm_start"
 
 
 def our_method(checkpoint: Path | None) -> Any:
-    """Our model as the benchmark's row asks it: one step, the mean.
-
-    Args:
-        checkpoint: its folder; None: the shipped one.
-    """
+    """Our model as the benchmark's row asks it: one step, the mean."""
     from unirender_evaluation.claims import OURS
     from unirender_evaluation.runs.config import BenchConfig, build_rows
 
@@ -31,13 +27,7 @@ def our_method(checkpoint: Path | None) -> Any:
 
 
 def run(what: WarmStart, scenes: Sequence[Scene], console: Console) -> list[Record]:
-    """Measures what is missing and writes `warm_start.md` and `warm_start.json`.
-
-    Args:
-        what: the measurement.
-        scenes: at least one.
-        console: for progress and tables.
-    """
+    """Measures what is missing and writes `warm_start.md` and `warm_start.json`."""
     with open_folder(what.out):
         total = len(scenes) * len(list(what.questions()))
         records, computed = collect(measure(what, scenes), total, "warm start", console)

@@ -5,13 +5,12 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from unirender_evaluation.comparisons import values_of
 from unirender_evaluation.light_metrics import PEAK_ANGLE, SCALED_LOG_RMSE
 from unirender_evaluation.metrics import DEFAULT_VARIANT
-from unirender_evaluation.multiview.tables import SECONDS
+from unirender_evaluation.multiview.tables import SECONDS, plain_column
 from unirender_evaluation.records import Record
-from unirender_evaluation.statistics import INTERVAL, Estimate, mean_estimate, paired_difference
-from unirender_evaluation.studies.cells import as_json, study_column
+from unirender_evaluation.statistics import INTERVAL
+from unirender_evaluation.studies.cells import as_json, difference, estimate
 from unirender_evaluation.studies.warm_start.measure import COLD, PICTURE, PREDICTION, STEPS, WARM
 from unirender_evaluation.tables.formats import format_estimate, header, json_text, signed
 from unirender_evaluation.tables.specs import Column
@@ -27,18 +26,18 @@ PAIRS = ((WARM, COLD), (WARM, PREDICTION))
 
 
 COLUMNS = (
-    study_column("albedo", "albedo", "psnr"),
-    study_column("albedo (aligned)", "albedo", "psnr", scale="aligned"),
-    study_column("roughness", "roughness", "mse"),
-    study_column("metallic", "metallic", "mse"),
-    study_column("light", "environment", SCALED_LOG_RMSE),
-    study_column("light", "environment", PEAK_ANGLE),
-    study_column("normal", "normal", "cosine"),
-    study_column("relit", "relit", "psnr"),
-    study_column("relit (aligned)", "relit", "psnr", scale="aligned"),
-    study_column("fit", "fit", "psnr"),
-    study_column("", "time", STEPS),
-    study_column("", "time", SECONDS),
+    plain_column("albedo", "albedo", "psnr"),
+    plain_column("albedo (aligned)", "albedo", "psnr", scale="aligned"),
+    plain_column("roughness", "roughness", "mse"),
+    plain_column("metallic", "metallic", "mse"),
+    plain_column("light", "environment", SCALED_LOG_RMSE),
+    plain_column("light", "environment", PEAK_ANGLE),
+    plain_column("normal", "normal", "cosine"),
+    plain_column("relit", "relit", "psnr"),
+    plain_column("relit (aligned)", "relit", "psnr", scale="aligned"),
+    plain_column("fit", "fit", "psnr"),
+    plain_column("", "time", STEPS),
+    plain_column("", "time", SECONDS),
 )
 
 
@@ -85,16 +84,6 @@ NOTES = (
 )
 
 
-def difference(records: Sequence[Record], a: str, b: str, column: Column) -> Estimate | None:
-    """a - b of one column over the scenes that both have; None where there is none or one is infinite."""
-    key = column.key(DEFAULT_VARIANT)
-    first, second = (values_of(records, method, key) for method in (a, b))
-    common = first.keys() & second.keys()
-    if not common or not all(math.isfinite(values[sample]) for values in (first, second) for sample in common):
-        return None
-    return paired_difference(first, second, {record.sample: record.object for record in records})
-
-
 def _difference(records: Sequence[Record], a: str, b: str, column: Column) -> str:
     found, digits = difference(records, a, b, column), column.metric.decimals
     if found is None:
@@ -103,16 +92,8 @@ def _difference(records: Sequence[Record], a: str, b: str, column: Column) -> st
     return f"{signed(found.mean, digits)}{interval}"
 
 
-def mean(records: Sequence[Record], method: str, column: Column) -> Estimate | None:
-    """The mean of one column; None where there is no value."""
-    own = [record for record in records if record.method == method and column.key(DEFAULT_VARIANT) in record.values]
-    if not own:
-        return None
-    return mean_estimate([record.values[column.key(DEFAULT_VARIANT)] for record in own], [r.object for r in own])
-
-
 def _mean(records: Sequence[Record], method: str, column: Column) -> str:
-    found = mean(records, method, column)
+    found = estimate(records, method, column.key(DEFAULT_VARIANT))
     return "-" if found is None else format_estimate(found, column.metric.decimals)[0]
 
 
@@ -121,7 +102,10 @@ def to_json(records: Sequence[Record], geometries: Sequence[str], run: Mapping[s
     blocks = {}
     for geometry in geometries:
         own = block(records, geometry)
-        means = {method: {c.key(DEFAULT_VARIANT): as_json(mean(own, method, c)) for c in COLUMNS} for method in LABELS}
+        means = {
+            method: {c.key(DEFAULT_VARIANT): as_json(estimate(own, method, c.key(DEFAULT_VARIANT))) for c in COLUMNS}
+            for method in LABELS
+        }
         pairs = {
             f"{a} - {b}": {c.key(DEFAULT_VARIANT): as_json(difference(own, a, b, c)) for c in COLUMNS} for a, b in PAIRS
         }
