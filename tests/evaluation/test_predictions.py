@@ -513,6 +513,32 @@ def test_the_name_that_was_probably_meant_is_said(suite: Suite, tmp_path: Path, 
     assert problem.startswith(f"{path}: answers no question about this picture (did you mean {meant}?), expected edit_")
 
 
+def test_a_folder_for_each_map_is_told_what_is_wrong(suite: Suite, tmp_path: Path) -> None:
+    task, path = asked(suite, tmp_path, "albedo.png")
+    (tmp_path / "normal").mkdir()
+    Image.new("RGB", (32, 32)).save(tmp_path / "normal" / f"{task.folder}_normal.png")
+    Image.new("RGB", (32, 32)).save(path)
+    (problem,) = problems_of(suite, tmp_path)
+    assert problem.startswith(
+        f"{tmp_path / 'normal'}: has 1 files named as pictures ({task.folder}_normal.png), expected a folder"
+    )
+
+
+def test_what_is_wrong_with_all_pictures_is_said_three_times(suite: Suite, tmp_path: Path) -> None:
+    pictures = sorted({task.folder for task in tasks(suite, "inverse", "single-image", list(suite.scenes))})
+    assert len(pictures) > 3
+    for number, picture in enumerate(pictures):
+        (tmp_path / picture).mkdir()
+        Image.new("RGB", (31 - number, 32)).save(tmp_path / picture / "albedo.png")
+    Image.new("RGB", (31, 32)).save(tmp_path / pictures[-1] / "normal.png")
+    with pytest.raises(PredictionError) as caught:
+        check_predictions(prediction_rows({"mine": tmp_path}), suite)
+    assert len(caught.value.problems) == len(pictures) + 1
+    _, *lines = str(caught.value).splitlines()
+    more = f"... and {len(pictures) - 3} more like this, of other pictures"
+    assert lines == [*caught.value.problems[:3], more, caught.value.problems[-1]]
+
+
 def test_another_methods_folder_and_an_archive_are_named_as_such(suite: Suite, tmp_path: Path) -> None:
     answer_all(suite, tmp_path / "all" / "other")
     (problem,) = problems_of(suite, tmp_path / "all")

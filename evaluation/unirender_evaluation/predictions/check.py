@@ -3,6 +3,7 @@ every file."""
 
 import difflib
 import json
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,7 @@ from unirender_evaluation.tasks import tasks
 PICTURE_LIKE = (".exr", ".hdr", ".jpeg", ".jpg", ".npy", ".npz", ".pfm", ".png", ".tif", ".tiff", ".webp")
 SETTINGS_LIKE = (".toml", ".toml.txt")  # of which one is read
 NEAR = 0.7  # likeness of names, of `difflib`: that of `convention` is 0.95, that of `config` 0.47
+SHOWN = 3  # lines that say the same
 SAME = 1e-3  # difference of two channels, below that of 8 bits
 # Of `bench export`, `decompose`.
 IGNORED = ("image.png", "mask.exr", "meta.json", *LIGHT_FILES, "environment.png", "mask.png")
@@ -35,8 +37,20 @@ class PredictionError(UnirenderError):
 
     def __init__(self, problems: list[str]) -> None:
         count = f"{len(problems)} problem{'' if len(problems) == 1 else 's'}"
-        super().__init__("\n".join([f"predictions: {count}, nothing was run", *problems]))
+        super().__init__("\n".join([f"predictions: {count}, nothing was run", *_shortened(problems)]))
         self.problems = tuple(problems)
+
+
+def _shortened(problems: list[str]) -> Iterator[str]:
+    """The lines; of those that say the same of files of one name, but for numbers, `SHOWN` and how many more."""
+    alike: dict[tuple[str, str], list[str]] = {}
+    for problem in problems:
+        place, _, said = problem.partition(": ")
+        alike.setdefault((Path(place).name, re.sub(r"[\d.]+", "0", said)), []).append(problem)
+    for lines in alike.values():
+        yield from lines[:SHOWN]
+        if len(lines) > SHOWN:
+            yield f"... and {len(lines) - SHOWN} more like this, of other pictures"
 
 
 @dataclass
@@ -128,6 +142,13 @@ def _unknown_picture(path: Path, asked: dict[str, Question], suite: str) -> str:
         return (
             f"{path}: has folders of {inside} of the pictures itself, expected them in {path.parent}; score it by "
             f"itself, with --predictions NAME={path}"
+        )
+    named = [inner.name for inner in _visible(path) if inner.is_file() and any(name in inner.name for name in asked)]
+    if named:
+        return (
+            f"{path}: has {len(named)} files named as pictures ({named[0]}), expected a folder for each picture and in "
+            "it files like albedo.png; a script in the documentation sorts them (docs/your_files.md, Files of other "
+            "methods)"
         )
     twins = [name for name in asked if name.casefold() == path.name.casefold()]
     close = twins or difflib.get_close_matches(path.name, asked, 1) or sorted(asked)[:1]
