@@ -503,6 +503,9 @@ def test_an_edit_behind_a_link_to_a_folder_is_part_of_the_key(suite: Suite, tmp_
         ("albedo.exr", "albedo.R, albedo.G, albedo.B of intrinsics.exr"),
         ("roughness.EXR", "roughness.Y of intrinsics.exr"),
         ("edit_m1_r05.exr", "edit_m100_r050.exr"),
+        ("basecolor.png", "albedo.png"),
+        ("metallicity.png", "metallic.png"),
+        ("ORM.png", "roughness.png and metallic.png, its green and its blue channel"),
     ],
 )
 def test_the_name_that_was_probably_meant_is_said(suite: Suite, tmp_path: Path, name: str, meant: str) -> None:

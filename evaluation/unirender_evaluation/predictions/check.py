@@ -25,6 +25,14 @@ from unirender_evaluation.tasks import tasks
 PICTURE_LIKE = (".exr", ".hdr", ".jpeg", ".jpg", ".npy", ".npz", ".pfm", ".png", ".tif", ".tiff", ".webp")
 SETTINGS_LIKE = (".toml", ".toml.txt")  # of which one is read
 NEAR = 0.7  # likeness of names, of `difflib`: that of `convention` is 0.95, that of `config` 0.47
+PACKED = "roughness.png and metallic.png, its green and its blue channel"
+ALIASES = {  # names of others, in small letters, and what they are here
+    "basecolor": "albedo.png",
+    "base_color": "albedo.png",
+    "metallic_roughness": PACKED,
+    "metallicroughness": PACKED,
+    "orm": PACKED,
+}
 SHOWN = 3  # lines that say the same
 SAME = 1e-3  # difference of two channels, below that of 8 bits
 # Of `bench export`, `decompose`.
@@ -199,6 +207,8 @@ def _meant(path: Path, question: Question) -> str:
     stem = path.stem.lower()
     if question.maps and path.suffix.lower() == ".exr" and f"{stem}.png" in MAP_FILES:
         return f" (did you mean {', '.join(MAP_CHANNELS[stem])} of intrinsics.exr?)"
+    if question.maps and stem in ALIASES:
+        return f" (did you mean {ALIASES[stem]}?)"
     names = [*question.pictures, *(MAP_FILES if question.maps else ()), *(LIGHT_FILES if question.light else ())]
     same = [name for name in names if name == path.name.lower()] or [name for name in names if Path(name).stem == stem]
     close = same or difflib.get_close_matches(path.name, names, 1, NEAR)
