@@ -40,9 +40,11 @@ def test_colours_and_lights_tell_in_which_order_they_are(mistake: str) -> None:
     assert only(light_gains(made(LIGHT), LIGHT)) == [mistake]
 
 
-def test_a_light_tells_a_half_turn_whatever_its_size_and_level() -> None:
-    assert only(light_gains(np.roll(7 * LIGHT, 16, axis=1), LIGHT)) == ["if_turned"]
-    assert max(light_gains(np.roll(LIGHT, 8, axis=1), LIGHT).values()) < 1, "a quarter"
+@pytest.mark.parametrize("columns", [8, 16, 24])
+def test_a_light_tells_quarter_turns_whatever_its_level(columns: int) -> None:
+    assert only(light_gains(np.roll(7 * LIGHT, columns, axis=1), LIGHT)) == ["if_turned"]
+    assert only(light_gains(LEFT(np.roll(7 * LIGHT, columns, axis=1)), LIGHT)) == ["if_mirrored_and_turned"]
+    assert max(light_gains(np.roll(LIGHT, columns + 4, axis=1), LIGHT).values()) < 1, "an eighth more"
 
 
 def test_the_gain_of_a_light_is_that_of_its_squared_log_rmse() -> None:
@@ -76,6 +78,28 @@ def test_normals_tell_side_signs_and_axes(mistake: str, found: np.ndarray) -> No
     assert only(normal_gains(3 * found, NORMAL, WHOLE)) == [mistake], "of any length"
 
 
+COVERAGE = np.where(RNG.random((12, 14, 1)) < 0.5, 1, RNG.uniform(0.4, 0.8, (12, 14, 1))).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        COLOUR * COVERAGE,  # premultiplied
+        COLOUR / COVERAGE,  # a straight picture that was taken for a premultiplied one
+        COLOUR * COVERAGE + 1 - COVERAGE,  # over white
+        srgb_decode(srgb_encode(COLOUR) * COVERAGE),
+        srgb_decode(srgb_encode(COLOUR) * COVERAGE + 1 - COVERAGE),
+        srgb_decode(srgb_encode(COLOUR) * COVERAGE) / COVERAGE,  # a picture: display values times the mask
+    ],
+)
+def test_edges_tell_what_is_mixed_into_them(found: np.ndarray) -> None:
+    gains = colour_gains(found, COLOUR, COVERAGE)
+    assert only(gains) == ["if_edges"]
+    assert "if_edges" not in colour_gains(found, COLOUR, WHOLE), "there is no edge"
+    noisy = COLOUR + np.float32(0.1) * RNG.random(COLOUR.shape, np.float32)
+    assert colour_gains(noisy, COLOUR, COVERAGE)["if_edges"] < 0
+
+
 def test_what_the_mask_leaves_out_tells_nothing() -> None:
     mask = WHOLE * (np.arange(14) < 7)[:, None]
     spoiled = np.where(mask > 0, COLOUR, 1 - COLOUR)
@@ -85,7 +109,8 @@ def test_what_the_mask_leaves_out_tells_nothing() -> None:
 
 
 def test_a_gain_is_the_ratio_of_squared_errors_in_db() -> None:
-    """Roughness 0.25 for 0.4 is wrong by 0.15; as its root by 0.1, a gain of 20 log10(1.5) dB; by 0.35 if inverted."""
+    """Roughness 0.25 for 0.4 is wrong by 0.15; as its root by 0.1, a gain of 20 log10(1.5) dB; by 0.35 if inverted,
+    and by 0.349 if decoded."""
 
     def maps(roughness: float, metallic: float | None) -> Intrinsics:
         one, other = (None if v is None else np.full((2, 2, 1), v, np.float32) for v in (roughness, metallic))
@@ -93,7 +118,8 @@ def test_a_gain_is_the_ratio_of_squared_errors_in_db() -> None:
 
     mask = np.ones((2, 2, 1), np.float32)
     found = roughness_gains(maps(0.25, None), maps(0.4, None), mask)
-    assert found == pytest.approx({"if_root": 3.522, "if_inverted": -7.360}, abs=1e-3)
+    assert found == pytest.approx({"if_decoded": -7.338, "if_root": 3.522, "if_inverted": -7.360}, abs=1e-3)
+    assert roughness_gains(maps(0.66519, None), maps(0.4, None), mask)["if_decoded"] == MOST_DB, "encoded, 0.4 is 0.665"
     # 0.5^2 + 0.4^2 = 0.41 as they are; exchanged 0.2^2 + 0.1^2 = 0.05
     assert roughness_gains(maps(0.7, 0.1), maps(0.2, 0.5), mask)["if_swapped"] == pytest.approx(9.138, abs=1e-3)
     assert roughness_gains(maps(0.5, 0.5), Intrinsics(), mask) == roughness_gains(Intrinsics(), maps(1, 1), mask) == {}

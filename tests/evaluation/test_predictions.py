@@ -15,7 +15,7 @@ from PIL.PngImagePlugin import PngInfo
 from sixteen_bit_files import write_png16
 from tiny_suites import make_suite
 
-from unirender.color import srgb_encode
+from unirender.color import srgb_encode, unpremultiply
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, intrinsics_channels, write_exr
 from unirender.intrinsics import Intrinsics
@@ -291,6 +291,48 @@ def test_a_picture_s_background_is_no_normal(suite: Suite, tmp_path: Path, level
         assert problem.startswith(f"{path}: the three channels of its normal are equal, expected x, y and z")
 
 
+def test_normals_that_are_encoded_as_colours_are_refused(suite: Suite, tmp_path: Path) -> None:
+    """They are longer than 1, as no mean of normals is: their directions would be off by some 30 degrees."""
+    task, path = asked(suite, tmp_path, "normal.png")
+    shown = (suite.intrinsics(task.scene, task.scene.materials[0]).require("normal")["normal"] + 1) / 2
+    for values, encoded in ((shown, False), ((shown + 0.5) / 2, False), (srgb_encode(shown), True)):
+        Image.fromarray(np.round(255 * values).astype(np.uint8)).save(path)
+        problems = problems_of(suite, tmp_path)
+        assert bool(problems) == encoded
+        assert all(
+            re.match(rf"{path}: its normals have a length of 1\.\d+ \(median\), expected 1", p) for p in problems
+        )
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_transparent_picture_has_to_say_that_it_is_straight(suite: Suite, tmp_path: Path, bits: int) -> None:
+    """Taken for premultiplied its edges were too bright. Opaque alpha says nothing, and that of maps is no matter."""
+    task, path = asked(suite, tmp_path, "render_given.png", "rendering", "given")
+    assert task.truth_image is not None
+    straight = srgb_encode(np.clip(unpremultiply(task.truth_image, task.mask), 0, 1))
+
+    def write(path: Path, alpha: np.ndarray) -> None:
+        levels = np.round(np.concatenate([straight, alpha], axis=-1) * (2**bits - 1))
+        write_png16(path, levels.astype(np.uint16)) if bits == 16 else Image.fromarray(levels.astype(np.uint8)).save(
+            path
+        )
+
+    write(path, np.ones_like(task.mask))
+    assert problems_of(suite, tmp_path) == ()
+    write(path, task.mask)
+    (problem,) = problems_of(suite, tmp_path)
+    assert problem.startswith(f"{path}: the picture has transparent pixels")
+    (tmp_path / "conventions.toml").write_text("premultiplied = false\n")
+    assert problems_of(suite, tmp_path) == ()
+    found = engine.answer(prediction_rows({"mine": tmp_path})[0], task).image
+    assert found is not None
+    np.testing.assert_allclose(found, np.clip(task.truth_image, 0, task.mask), rtol=0, atol=0.006)
+    (tmp_path / "conventions.toml").unlink()
+    path.unlink()
+    write(asked(suite, tmp_path, "albedo.png")[1], task.mask)
+    assert problems_of(suite, tmp_path) == ()
+
+
 @pytest.mark.parametrize("colour", ["linear", "srgb"])
 def test_values_too_large_to_score_are_problems(suite: Suite, tmp_path: Path, colour: str) -> None:
     """What the check lets through is scored with numbers."""
@@ -461,6 +503,9 @@ def test_an_edit_behind_a_link_to_a_folder_is_part_of_the_key(suite: Suite, tmp_
         ("albedo.exr", "albedo.R, albedo.G, albedo.B of intrinsics.exr"),
         ("roughness.EXR", "roughness.Y of intrinsics.exr"),
         ("edit_m1_r05.exr", "edit_m100_r050.exr"),
+        ("basecolor.png", "albedo.png"),
+        ("metallicity.png", "metallic.png"),
+        ("ORM.png", "roughness.png and metallic.png, its green and its blue channel"),
     ],
 )
 def test_the_name_that_was_probably_meant_is_said(suite: Suite, tmp_path: Path, name: str, meant: str) -> None:
@@ -469,6 +514,32 @@ def test_the_name_that_was_probably_meant_is_said(suite: Suite, tmp_path: Path, 
     path.write_bytes(b"")
     (problem,) = problems_of(suite, tmp_path)
     assert problem.startswith(f"{path}: answers no question about this picture (did you mean {meant}?), expected edit_")
+
+
+def test_a_folder_for_each_map_is_told_what_is_wrong(suite: Suite, tmp_path: Path) -> None:
+    task, path = asked(suite, tmp_path, "albedo.png")
+    (tmp_path / "normal").mkdir()
+    Image.new("RGB", (32, 32)).save(tmp_path / "normal" / f"{task.folder}_normal.png")
+    Image.new("RGB", (32, 32)).save(path)
+    (problem,) = problems_of(suite, tmp_path)
+    assert problem.startswith(
+        f"{tmp_path / 'normal'}: has 1 files named as pictures ({task.folder}_normal.png), expected a folder"
+    )
+
+
+def test_what_is_wrong_with_all_pictures_is_said_three_times(suite: Suite, tmp_path: Path) -> None:
+    pictures = sorted({task.folder for task in tasks(suite, "inverse", "single-image", list(suite.scenes))})
+    assert len(pictures) > 3
+    for number, picture in enumerate(pictures):
+        (tmp_path / picture).mkdir()
+        Image.new("RGB", (31 - number, 32)).save(tmp_path / picture / "albedo.png")
+    Image.new("RGB", (31, 32)).save(tmp_path / pictures[-1] / "normal.png")
+    with pytest.raises(PredictionError) as caught:
+        check_predictions(prediction_rows({"mine": tmp_path}), suite)
+    assert len(caught.value.problems) == len(pictures) + 1
+    _, *lines = str(caught.value).splitlines()
+    more = f"... and {len(pictures) - 3} more like this, of other pictures"
+    assert lines == [*caught.value.problems[:3], more, caught.value.problems[-1]]
 
 
 def test_another_methods_folder_and_an_archive_are_named_as_such(suite: Suite, tmp_path: Path) -> None:

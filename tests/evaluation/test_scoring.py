@@ -108,18 +108,25 @@ def exchanged(maps: Intrinsics) -> Intrinsics:
     return maps.replace(roughness=maps.metallic, metallic=maps.roughness)
 
 
+def premultiplied(maps: Intrinsics) -> Intrinsics:
+    found = maps.require("albedo", "mask")
+    return maps.replace(albedo=found["albedo"] * found["mask"])
+
+
 MADE: dict[
     str, tuple[str, Callable[[Intrinsics], Intrinsics]]
 ] = {  # mistake -> the quantity that tells, how it is made
     "if_decoded": ("albedo", changed("albedo", srgb_encode)),
     "if_encoded": ("albedo", changed("albedo", srgb_decode)),
     "if_bgr": ("specular", changed("specular", lambda x: x[..., ::-1])),
+    "if_edges": ("albedo", premultiplied),
     "if_mirrored": ("normal", changed("normal", lambda x: x[:, ::-1] * np.array([-1, 1, 1], np.float32))),
     "if_upside_down": ("diffuse", changed("diffuse", lambda x: x[::-1])),
     "if_shifted": ("albedo", changed("albedo", lambda x: np.roll(x, 1, 0))),
     "if_other_signs": ("normal", changed("normal", lambda x: -x)),
     "if_other_axes": ("normal", changed("normal", lambda x: x[..., [0, 2, 1]] * np.array([1, -1, 1], np.float32))),
     "if_turned": ("environment", changed("environment", lambda x: np.roll(x, 16, 1))),
+    "if_mirrored_and_turned": ("environment", changed("environment", lambda x: np.roll(x[:, ::-1], 8, 1))),
     "if_inverted": ("roughness", changed("roughness", lambda x: 1 - x)),
     "if_root": ("roughness", changed("roughness", np.square)),
     "if_swapped": ("roughness", exchanged),

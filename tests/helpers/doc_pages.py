@@ -12,6 +12,7 @@ import pytest
 import torch
 from accelerate.tracking import GeneralTracker, on_main_process
 from inline_executor import Inline
+from PIL import Image
 from reference_scenes import environment, sphere
 from synthetic_shards import own_picture, write_dataset
 from tiny_models import TRAIN, make_pipeline
@@ -135,6 +136,36 @@ def check_predictions(names: Names) -> None:
     assert not folder_problems(PredictionFolder(Path("predictions")), questions(suite), "ball")
 
 
+def other_method() -> Names:
+    """What a method may have written of the pictures of a tiny suite, four times as large and over white."""
+    export_inputs(make_suite(Path("suite")), Path("inputs"))
+    for path in sorted(Path("inputs").glob("*/image.png")):
+        picture, shown = path.parent.name, np.asarray(Image.open(path))
+        over_white = Image.fromarray(np.where(shown[..., 3:] > 0, shown[..., :3], np.uint8(255)))
+        large = over_white.resize((4 * over_white.width, 4 * over_white.height), Image.Resampling.BICUBIC)
+        for name in (f"{picture}/0000.basecolor.jpg", f"rough/{picture}.png", f"depth/{picture}.png"):
+            target = Path("written") / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            large.convert("RGB" if "base" in name else "L").save(target, quality=100)
+    sys.argv[:] = ["gather.py", "inputs", "written", "predictions"]
+    return {}
+
+
+def check_gathered(names: Names) -> None:
+    """All is found and fits, and less of the white behind is in its colours than in those of a plain reduction."""
+    predictions = Path("predictions")
+    assert not folder_problems(PredictionFolder(predictions), questions(make_suite(Path("again"))), "ball")
+    assert {path.name for path in predictions.glob("*/*")} == {"albedo.png", "roughness.png"}
+    for path in predictions.glob("*/albedo.png"):
+        shown, found = (Image.open(each) for each in (Path("inputs") / path.parent.name / "image.png", path))
+        plain = Image.open(Path("written") / path.parent.name / "0000.basecolor.jpg").resize(
+            shown.size, Image.Resampling.BOX
+        )
+        true, *others = (np.asarray(each, np.float64) for each in (shown, found, plain))
+        error, plain_error = (np.sum(true[..., 3:] * (each - true[..., :3]) ** 2) for each in others)
+        assert error < 0.6 * plain_error
+
+
 def shaded() -> Names:
     maps = own_picture(0)[1]
     gradient = np.ones((16, 16, 3), np.float32)
@@ -249,6 +280,7 @@ EXAMPLES = {
     "results_format.md": Example(predicted, check=check_score),
     "score_your_method.md": Example(stranger, check=check_predictions),
     "shade.md": Example(shaded, {"spp=256": "spp=16", "spp=64": "spp=16"}, check_gradients),
+    "your_files.md": Example(other_method, check=check_gathered),
     "tour.md": Example(mug, {"resolution=128": "resolution=32", "spp=256": "spp=16"}, check_tour),
     "training.md": Example(
         training,

@@ -11,7 +11,7 @@ from itertools import permutations, product
 import numpy as np
 from jaxtyping import Float
 
-from unirender.color import srgb_encode
+from unirender.color import srgb_decode, srgb_encode
 from unirender.intrinsics import Intrinsics
 from unirender.light.environment import resample_environment
 from unirender_evaluation import metrics
@@ -40,10 +40,12 @@ MISTAKES: Mapping[str, Mistake] = {  # by the name of the metric that has the ga
     "if_bgr": Mistake("with red and blue exchanged (BGR?)", PLACE),
     "if_other_signs": Mistake("with other signs (+x is right, +y up, +z to the viewer)", PLACE),
     "if_other_axes": Mistake("with x, y and z exchanged (z up?)", PLACE),
+    "if_edges": Mistake("with other edges (mixed with black or white, or straight for premultiplied?)", PLACE),
     "if_mirrored": Mistake("mirrored left to right", PLACE),
     "if_upside_down": Mistake("upside down (rows from the bottom?)", PLACE),
     "if_shifted": Mistake("moved by one pixel (cropped or resampled by other rules?)", PLACE),
-    "if_turned": Mistake("turned by half a turn (its middle is behind the camera)", PLACE),
+    "if_turned": Mistake("turned by quarter turns (its middle is behind the camera)", PLACE),
+    "if_mirrored_and_turned": Mistake("mirrored and turned by quarter turns (its middle is behind the camera)", PLACE),
     "if_inverted": Mistake("taken for 1 minus it (smoothness?)", TONE),
     "if_root": Mistake("as its square root (the GGX alpha, or too low throughout?)", TONE),
     "if_swapped": Mistake("exchanged with metallic", TONE),
@@ -79,6 +81,8 @@ def colour_gains(found: Map, true: Map, mask: Mask) -> dict[str, float]:
         "if_upside_down": [shown[::-1]],
         "if_shifted": _moved(shown),
     }
+    if np.any((mask > 0) & (mask < 1)):
+        undone["if_edges"] = _other_edges(found, shown, mask)
     as_it_is = error(shown)
     gains = {name: _gain(as_it_is, map(error, answers)) for name, answers in undone.items()}
     as_bright = srgb_encode(np.clip(metrics.align_scale(found, true, mask, "aligned"), 0, 1))
@@ -126,10 +130,13 @@ def light_gains(found: Light, true: Float[np.ndarray, "h2 w2 3"]) -> dict[str, f
         "if_bgr": p[..., ::-1],
         "if_mirrored": p[:, ::-1],
         "if_upside_down": p[::-1],
-        "if_turned": np.roll(p, SHAPE[1] // 2, 1),
     }
     as_it_is = error(p)
-    return {name: _gain(as_it_is, [error(answer)]) for name, answer in undone.items()}
+    gains = {name: _gain(as_it_is, [error(answer)]) for name, answer in undone.items()}
+    quarters = [SHAPE[1] * quarter // 4 for quarter in (1, 2, 3)]
+    for name, side in (("if_turned", p), ("if_mirrored_and_turned", p[:, ::-1])):
+        gains[name] = _gain(as_it_is, [error(np.roll(side, by, 1)) for by in quarters])
+    return gains
 
 
 def roughness_gains(found: Intrinsics, true: Intrinsics, mask: Mask) -> dict[str, float]:
@@ -137,7 +144,7 @@ def roughness_gains(found: Intrinsics, true: Intrinsics, mask: Mask) -> dict[str
     p, t = found.roughness, true.roughness
     if p is None or t is None:
         return {}
-    undone = {"if_inverted": 1 - p, "if_root": np.sqrt(p)}
+    undone = {"if_decoded": srgb_decode(p), "if_inverted": 1 - p, "if_root": np.sqrt(p)}
     gains = {name: _gain(metrics.mse(p, t, mask), [metrics.mse(x, t, mask)]) for name, x in undone.items()}
     m, n = found.metallic, true.metallic
     if m is None or n is None:
@@ -151,6 +158,17 @@ def roughness_gains(found: Intrinsics, true: Intrinsics, mask: Mask) -> dict[str
 def _gain(error: float, undone: Iterable[float]) -> float:
     """dB by which the least of the errors is below another one, in [-MOST_DB, MOST_DB]."""
     return float(np.clip(10 * np.log10((error + EXACT) / (min(undone) + EXACT)), -MOST_DB, MOST_DB))
+
+
+def _other_edges(found: Map, shown: Map, mask: Mask) -> list[Map]:
+    """A map, linear and as `shown`, as it would be if its colours were multiplied by the coverage once more or once
+    less, or had been mixed with white; in linear light or as display values."""
+    coverage = np.where(mask > 0, mask, 1)
+    white = 1 - coverage
+    multiplied = srgb_encode(np.clip(found * coverage, 0, 1))
+    in_linear = [found / coverage, (found - white) / coverage]
+    as_shown = [multiplied, shown / coverage, (shown - white) / coverage, multiplied / coverage]
+    return [*(srgb_encode(np.clip(x, 0, 1)) for x in in_linear), *(np.clip(x, 0, 1) for x in as_shown)]
 
 
 def _moved(x: Map) -> list[Map]:

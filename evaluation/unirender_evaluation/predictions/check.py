@@ -3,6 +3,7 @@ every file."""
 
 import difflib
 import json
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,15 @@ from unirender_evaluation.tasks import tasks
 PICTURE_LIKE = (".exr", ".hdr", ".jpeg", ".jpg", ".npy", ".npz", ".pfm", ".png", ".tif", ".tiff", ".webp")
 SETTINGS_LIKE = (".toml", ".toml.txt")  # of which one is read
 NEAR = 0.7  # likeness of names, of `difflib`: that of `convention` is 0.95, that of `config` 0.47
+PACKED = "roughness.png and metallic.png, its green and its blue channel"
+ALIASES = {  # names of others, in small letters, and what they are here
+    "basecolor": "albedo.png",
+    "base_color": "albedo.png",
+    "metallic_roughness": PACKED,
+    "metallicroughness": PACKED,
+    "orm": PACKED,
+}
+SHOWN = 3  # lines that say the same
 SAME = 1e-3  # difference of two channels, below that of 8 bits
 # Of `bench export`, `decompose`.
 IGNORED = ("image.png", "mask.exr", "meta.json", *LIGHT_FILES, "environment.png", "mask.png")
@@ -35,8 +45,20 @@ class PredictionError(UnirenderError):
 
     def __init__(self, problems: list[str]) -> None:
         count = f"{len(problems)} problem{'' if len(problems) == 1 else 's'}"
-        super().__init__("\n".join([f"predictions: {count}, nothing was run", *problems]))
+        super().__init__("\n".join([f"predictions: {count}, nothing was run", *_shortened(problems)]))
         self.problems = tuple(problems)
+
+
+def _shortened(problems: list[str]) -> Iterator[str]:
+    """The lines; of those that say the same of files of one name, but for numbers, `SHOWN` and how many more."""
+    alike: dict[tuple[str, str], list[str]] = {}
+    for problem in problems:
+        place, _, said = problem.partition(": ")
+        alike.setdefault((Path(place).name, re.sub(r"[\d.]+", "0", said)), []).append(problem)
+    for lines in alike.values():
+        yield from lines[:SHOWN]
+        if len(lines) > SHOWN:
+            yield f"... and {len(lines) - SHOWN} more like this, of other pictures"
 
 
 @dataclass
@@ -129,6 +151,13 @@ def _unknown_picture(path: Path, asked: dict[str, Question], suite: str) -> str:
             f"{path}: has folders of {inside} of the pictures itself, expected them in {path.parent}; score it by "
             f"itself, with --predictions NAME={path}"
         )
+    named = [inner.name for inner in _visible(path) if inner.is_file() and any(name in inner.name for name in asked)]
+    if named:
+        return (
+            f"{path}: has {len(named)} files named as pictures ({named[0]}), expected a folder for each picture and in "
+            "it files like albedo.png; a script in the documentation sorts them (docs/your_files.md, Files of other "
+            "methods)"
+        )
     twins = [name for name in asked if name.casefold() == path.name.casefold()]
     close = twins or difflib.get_close_matches(path.name, asked, 1) or sorted(asked)[:1]
     there = path.with_name(close[0])  # on a file system without case it may be this very folder
@@ -178,6 +207,8 @@ def _meant(path: Path, question: Question) -> str:
     stem = path.stem.lower()
     if question.maps and path.suffix.lower() == ".exr" and f"{stem}.png" in MAP_FILES:
         return f" (did you mean {', '.join(MAP_CHANNELS[stem])} of intrinsics.exr?)"
+    if question.maps and stem in ALIASES:
+        return f" (did you mean {ALIASES[stem]}?)"
     names = [*question.pictures, *(MAP_FILES if question.maps else ()), *(LIGHT_FILES if question.light else ())]
     same = [name for name in names if name == path.name.lower()] or [name for name in names if Path(name).stem == stem]
     close = same or difflib.get_close_matches(path.name, names, 1, NEAR)

@@ -37,7 +37,7 @@ from unirender.intrinsics import MAPS, Intrinsics
 from unirender_evaluation.methods.method import Image, Mask
 from unirender_evaluation.methods.plausible import picture_doubt
 from unirender_evaluation.predictions.conventions import FILE, Conventions, read_conventions
-from unirender_evaluation.predictions.png import read_png
+from unirender_evaluation.predictions.png import is_transparent, read_png
 from unirender_evaluation.task import LIGHT_ANSWER, Task
 
 PNG_MAPS = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse")
@@ -48,6 +48,7 @@ SUFFIXES = (".exr", ".png")
 READ = tuple(channel for channels in MAP_CHANNELS.values() for channel in channels)
 HARMLESS = ("R", "G", "B", "A", "depth.Z")  # a picture beside the maps; depth, which public sets ask for
 NO_NORMAL = (0.01, 1.5)  # lengths: 0 in 8 bits has up to 0.007, and black and white, behind an object, have 1.7
+LONGEST = 1.1  # median length of the normals of a PNG: of sRGB-encoded ones it is about 1.2
 BRIGHTEST = 1e30  # divided by an edge's coverage, much brighter values are no float32 any more
 
 
@@ -140,10 +141,15 @@ class PredictionFolder:
 
         Raises:
             UnirenderError: the file is broken, has another size than the mask, values that are not finite or beyond
-                `BRIGHTEST`, or is no linear, premultiplied radiance (`plausible.picture_doubt`).
+                `BRIGHTEST`, is transparent, or is no linear, premultiplied radiance (`plausible.picture_doubt`).
         """
         with _named(path):
             stored = channels_rgb(read_exr(path)[0]) if path.suffix == ".exr" else self._read_png(path, 3, "image")
+            if path.suffix == ".png" and self.conventions.premultiplied and is_transparent(path):
+                raise UnirenderError(
+                    "the picture has transparent pixels, whose colour in a PNG is straight, expected a premultiplied "
+                    f"picture; say premultiplied = false in {FILE}, or write it without alpha if it is premultiplied"
+                )
             _check_size(path, "the picture", stored, mask)
             if not np.isfinite(stored).all():
                 raise UnirenderError(f"predictions: {path} has NaN or infinite values, expected finite radiance")
@@ -154,7 +160,7 @@ class PredictionFolder:
             if (doubt := picture_doubt(image, mask)) is not None:
                 raise UnirenderError(
                     f"the picture is no linear, premultiplied radiance: {doubt}; make it so, or say in {FILE} what it "
-                    "is (premultiplied = false: straight colour)"
+                    "is (premultiplied = false: straight colour, not mixed with what is behind)"
                 )
         return image
 
@@ -177,7 +183,7 @@ class PredictionFolder:
 
         Raises:
             UnirenderError: the file is broken, without maps or with channels that nothing reads, or a map has another
-                size than the mask or values outside the contract.
+                size than the mask, values outside the contract or, in a PNG, normals that are too long.
         """
         with _named(path):
             return self._read_exr_maps(path, mask, camera) if path.suffix == ".exr" else self._read_png_map(path, mask)
@@ -214,6 +220,7 @@ class PredictionFolder:
             value = 2 * value - 1
             length = np.linalg.norm(value, axis=-1, keepdims=True)
             there = (length > NO_NORMAL[0]) & (length < NO_NORMAL[1]) & (mask > 0)
+            _check_lengths(length[there])
             value = np.divide(value, length, out=np.zeros_like(value), where=there)
         elif name in COLOURS:
             value = self.conventions.linear(value, ".png")
@@ -238,6 +245,14 @@ def _named(path: Path) -> Iterator[None]:
         yield
     except UnirenderError as error:
         raise UnirenderError(str(error) if str(path) in str(error) else f"predictions: {path}: {error}") from None
+
+
+def _check_lengths(lengths: Float[np.ndarray, " n"]) -> None:
+    if lengths.size and (median := float(np.median(lengths))) > LONGEST:
+        raise UnirenderError(
+            f"its normals have a length of {median:.2f} (median), expected 1: write (n + 1) / 2 of unit normals, "
+            "without encoding it to sRGB"
+        )
 
 
 def _check_brightness(what: str, value: Float[np.ndarray, "h w c"]) -> None:

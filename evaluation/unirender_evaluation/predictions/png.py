@@ -1,7 +1,7 @@
 """PNG files of predictions, of 8 and 16 bits a channel, as values in [0, 1]."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -62,6 +62,15 @@ def read_png(path: Path, channels: int, encoded: bool = False) -> Float[np.ndarr
             "the blue; of a network's three channels that should be one, their mean"
         )
     return value.mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
+
+
+def is_transparent(path: Path) -> bool:
+    """Whether a PNG that can be read has pixels that are not opaque."""
+    from PIL import Image as Pil
+
+    with Pil.open(path) as picture:
+        lowest: Any = picture.convert("RGBA").getchannel("A").getextrema()[0]
+        return picture.has_transparency_data and lowest < 255
 
 
 def _other_colors(path: Path, picture: "Image.Image") -> str | None:
