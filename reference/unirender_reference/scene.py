@@ -18,6 +18,7 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import as_numbers, as_radiance
 from unirender.light.environment import drawable
 from unirender_reference import materials
+from unirender_reference.arrays import aligned
 from unirender_reference.backend import mitsuba
 from unirender_reference.shapes import MeshObject
 
@@ -111,7 +112,7 @@ def mesh_shape(obj: MeshObject, bsdf: Any) -> Any:
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = np.ascontiguousarray(obj.vertices, np.float32).ravel()
     parameters["vertex_normals"] = np.ascontiguousarray(obj.normals, np.float32).ravel()
-    parameters["vertex_texcoords"] = np.ascontiguousarray(uv, np.float32).ravel()
+    parameters["vertex_texcoords"] = aligned(uv.astype(np.float32)).ravel()  # read in pairs
     parameters["faces"] = np.ascontiguousarray(obj.faces, np.uint32).ravel()
     parameters.update()
     return mesh

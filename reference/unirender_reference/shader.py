@@ -24,6 +24,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
+from unirender_reference.arrays import aligned, components
 from unirender_reference.backend import mitsuba
 from unirender_reference.samplers import stratified_sampler
 from unirender_reference.scene import envmap_rows, mesh_shape, sensor_dict
@@ -84,10 +85,9 @@ class Shader:
         if not inside.any():
             raise UnirenderError("shader: the mask is empty, expected at least one pixel to shade")
         self.points = int(inside.sum())
-        self.coverage = mi.Float(np.ascontiguousarray(mask[inside][:, 0], np.float32))
-        self._pixel = mi.UInt32(np.flatnonzero(inside).astype(np.uint32))
-        view = camera.view_directions(self.height, self.width)[inside]
-        self._view = mi.Vector3f(np.ascontiguousarray(view.T))
+        self.coverage = mi.Float(aligned(mask[inside][:, 0]))
+        self._pixel = mi.UInt32(aligned(np.flatnonzero(inside).astype(np.uint32)))
+        self._view = mi.Vector3f(*components(camera.view_directions(self.height, self.width)[inside]))
         first = mi.Bitmap(np.ones((3, 4, 3), np.float32))
         scene: dict[str, Any] = {"type": "scene", "light": {"type": "envmap", "bitmap": first}}
         if geometry is not None:
@@ -267,7 +267,7 @@ def tensors(values: Mapping[str, Float[np.ndarray, "..."]], attached: Sequence[s
     import drjit as dr
 
     mi = mitsuba()
-    made = {name: mi.TensorXf(np.ascontiguousarray(array, np.float32)) for name, array in values.items()}
+    made = {name: mi.TensorXf(aligned(np.asarray(array, np.float32))) for name, array in values.items()}
     for name in attached:
         dr.enable_grad(made[name])
     return made

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 
 from unirender.exr import exr_bytes, intrinsics_channels
 from unirender.light.environment import environment_directions
+from unirender_reference.arrays import components
 from unirender_reference.backend import mitsuba
 from unirender_reference.passes import derive_seed
 from unirender_reference.plan import GroupPlan
@@ -96,10 +97,10 @@ def _free(
     """Whether rays from what is seen at positions of the picture, in pixels, meet nothing; whether anything is seen."""
     mi = mitsuba()
     scene = renderer.scene.show("principled", {})
-    seen = mi.Point2f((position / renderer.resolution).astype(np.float32))
+    seen = mi.Point2f(*components((position / renderer.resolution).T))
     ray, _ = scene.sensors()[0].sample_ray_differential(0.0, 0.5, seen, mi.Point2f(0.5))
     coherent = True  # rays of one pixel follow each other
     surface = scene.ray_intersect(ray, mi.RayFlags.All, coherent)
     valid = surface.is_valid()
-    blocked = scene.ray_test(surface.spawn_ray(mi.Vector3f(towards.astype(np.float32))), valid)
+    blocked = scene.ray_test(surface.spawn_ray(mi.Vector3f(*components(towards.T))), valid)
     return np.array(~(valid & blocked)), np.array(valid)

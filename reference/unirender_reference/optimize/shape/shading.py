@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from unirender_reference.arrays import components
 from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.solution import Solution
@@ -55,7 +56,7 @@ def shade_points(
     view, place = np.divmod(pixel, cameras.height * cameras.width)
     row, column = np.divmod(place, cameras.width)
     direction = cameras.rays(np.stack([column, row], axis=1) + 0.5, view)
-    ray = mi.Ray3f(_points(cameras.center[view]), mi.Vector3f(_points(direction)))
+    ray = mi.Ray3f(mi.Point3f(*components(cameras.center[view])), mi.Vector3f(*components(direction)))
     first = scene.ray_intersect_preliminary(ray)
     hit = first.compute_surface_interaction(ray)
     kept = np.flatnonzero(np.array(hit.is_valid()) & (np.array(hit.wi.z) > LEAST_FACING))
@@ -120,7 +121,3 @@ def _mean(values: Any, lanes: int) -> Float[np.ndarray, " n"]:
     import drjit as dr
 
     return np.array(dr.block_sum(values, lanes)) / lanes
-
-
-def _points(points: Float[np.ndarray, "n 3"]) -> Any:
-    return mitsuba().Point3f(np.ascontiguousarray(points.T, np.float32))

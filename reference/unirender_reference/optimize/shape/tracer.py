@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from unirender_reference.arrays import components
 from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.shape.cameras import Cameras
 
@@ -70,5 +71,4 @@ class MeshTracer:
 
 def _rays(origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Any:
     mi = mitsuba()
-    origin = mi.Point3f(np.ascontiguousarray(origins.T, np.float32))
-    return mi.Ray3f(origin, mi.Vector3f(np.ascontiguousarray(directions.T, np.float32)))
+    return mi.Ray3f(mi.Point3f(*components(origins)), mi.Vector3f(*components(directions)))

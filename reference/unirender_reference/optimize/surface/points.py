@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
+from unirender_reference.arrays import components
 from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.views import View
 from unirender_reference.passes import derive_seed
@@ -141,7 +142,7 @@ def mapped_points(
     inside = (mask[..., 0] > 0) & np.any(normal != 0, axis=-1)
     if not inside.any():
         raise UnirenderError("normals: they are 0 wherever the mask covers a pixel; expected a normal for each of them")
-    columns = (mi.Vector3f(np.ascontiguousarray(x[inside].T, np.float32)) for x in (normal, view))
+    columns = (mi.Vector3f(*components(x[inside])) for x in (normal, view))
     bent = np.array(facing(*columns)).T[:, None]
     pixel, nowhere = np.flatnonzero(inside), np.zeros((len(bent), 1, 2), np.float32)
     position, to_viewer = np.zeros_like(bent), view[inside][:, None].astype(np.float32)

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from unirender_reference.arrays import aligned, components
 from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.surface.points import SurfacePoints
 from unirender_reference.optimize.transport.bsdf_lobes import diffuse_lobes, gloss_lobe, schlick, visible_density
@@ -131,10 +132,10 @@ class _Surface:
         mi = mitsuba()
 
         def vectors(array: Float[np.ndarray, "n s 3"]) -> Any:
-            return mi.Vector3f(np.ascontiguousarray(array[rows].reshape(-1, 3).T))
+            return mi.Vector3f(*components(array[rows].reshape(-1, 3)))
 
         self.scene = scene
-        self.hit = mi.Bool(points.hit[rows].ravel())
+        self.hit = mi.Bool(aligned(points.hit[rows].ravel()))
         self.position, self.normal = vectors(points.position), vectors(points.normal)
         self.side, self.to_viewer = vectors(points.side), vectors(points.to_viewer)
         self.samples = points.hit.shape[1]
