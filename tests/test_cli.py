@@ -596,11 +596,11 @@ USAGE = {
     "device": (["decompose", "PICTURE", "--output", "OUT", "--device", "tpu"], "tpu"),
     "exposure": (["relight", "PICTURE", "--environment", "L", "--output", "OUT", "--exposure", "99"], "stops"),
     "exposure of nothing": (["render", "FOLDER", "--output", "OUT", "--exposure", "1"], "--environment"),
-    "preset": (["train", "--data", "FOLDER", "--preset", "huge"], "expected one of: tiny"),
+    "preset": (["train", "--data", "FOLDER", "--preset", "huge"], "expected one of tiny"),
     "best of nothing": (["train", "--data", "FOLDER", "--keep-best", "albedo.psnr"], "--validate"),
     "best of another": (
         ["train", "--data", "FOLDER", "--out", "OUT", "--validate", "1", "--keep-best", "albedo.snr"],
-        "expected one of: albedo.psnr, normal.cosine, metallic.mse, roughness.mse, render.psnr, edit.psnr",
+        "expected one of albedo.psnr, normal.cosine, metallic.mse, roughness.mse, render.psnr, edit.psnr",
     ),
     "pairs": (["dataset", "--pairs", "5", "--out", "OUT"], "expected 3 x lights"),
 }

@@ -38,6 +38,7 @@ VOCABULARY = {
         "system.machine",
         "system.run_progress",
         "system.whole_files",
+        "system.wording",
         "system.worker_pool",
         "system.writing",
         "vectors",

@@ -95,6 +95,7 @@ OUTSIDE = (
     "system/notices",
     "system/run_progress",
     "system/system_errors",
+    "system/wording",
     "system/worker_pool",
     "system/writing",
 )
