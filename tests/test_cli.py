@@ -345,7 +345,7 @@ def test_parts_of_the_mask_that_are_left_out_are_told(tmp_path: Path, capsys: py
     pixels[5, 5:7, 3] = 255
     (tmp_path / "pictures").mkdir()
     Image.fromarray(pixels).save(tmp_path / "pictures" / "a.png")
-    said = "2 pixels of the mask are taken for stray ones and left out"
+    said = "left out as stray: 2 pixels of the mask, in parts away from the object"
     assert run("decompose", tmp_path / "pictures" / "a.png", "--output", tmp_path / "out") == 0
     assert capsys.readouterr().err.count(said) == 1
     assert run("decompose", tmp_path / "pictures", "--output", tmp_path / "folder") == 0
@@ -746,7 +746,7 @@ def test_dataset_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[
     arguments = ("--objects", "1", "--pairs", "3", "--resolution", "8", "--spp", "4", "--workers", "1")
     assert run("dataset", *arguments, "--out", tmp_path / "data") == 0
     printed = capsys.readouterr()
-    assert "3 pairs in 1 groups" in printed.out
+    assert "3 pairs in 1 group," in printed.out
     assert "% of it spent rendering" in printed.out
     assert "groups: 0 of 1\n" in printed.err, "a log shows that it goes on"
     assert run("dataset", *arguments, "--out", tmp_path / "data") == 0

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.wording import counted
 from unirender.system.writing import writing
 from unirender_reference.measure.output import ELSEWHERE, full_disk
 from unirender_reference.optimize.machine import require_cores
@@ -159,8 +160,8 @@ class Optimize:
         record = json.loads((self.out / SOLUTION_FILE).read_text(encoding="utf-8"))
         figures = ", ".join(f"{name.removesuffix('_psnr_db')} {db:.2f} dB" for name, db in record["figures"].items())
         print(
-            f"{self.out}: {len(views.seen)} views, {record['seconds']:.1f} s; masked PSNR of the pictures: {figures}; "
-            f"IoU of the masks: {record['mask_iou']:.3f}"
+            f"{self.out}: {counted(len(views.seen), 'view')}, {record['seconds']:.1f} s; masked PSNR of the pictures: "
+            f"{figures}; IoU of the masks: {record['mask_iou']:.3f}"
         )
         if note := refinement_note(record["stages"]):
             print(note)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from unirender.command_line.input_picture import MANY_CLIPPED
 from unirender.errors import UsageError
 from unirender.system.notices import notice
+from unirender.system.wording import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -47,7 +48,7 @@ def parts_left_out(mask: "np.ndarray | None", side: int) -> dict[str, str]:
     if not beside:
         return {}
     return {
-        "parts": f"{beside} pixels of the mask are taken for stray ones and left out: parts away from the object, "
+        "parts": f"left out as stray: {counted(beside, 'pixel')} of the mask, in parts away from the object, "
         f"together less than {STRAY:.1%} of it; to have their maps, give them a mask of their own"
     }
 
