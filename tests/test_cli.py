@@ -533,6 +533,30 @@ def test_an_existing_folder_is_kept(ball: Path, tmp_path: Path, capsys: pytest.C
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("decompose", "BALL", "--output", "OLD"),
+        ("edit", "BALL", "--output", "NEW", "--metallic", "1", "--size", "65"),
+        ("relight", "BALL", "--output", "NEW", "--environment", "none.hdr"),
+        ("render", "MAPS", "--output", "NEW", "--fov", "30", "--checkpoint", "none"),
+        ("render", "BARE", "--output", "NEW", "--fov", "30"),
+    ],
+)
+def test_a_refusal_stands_alone(
+    arguments: tuple[str, ...], ball: Path, decomposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What a picture lacks is of no interest to whom it was refused."""
+    maps = read_result(decomposed)
+    write_exr(tmp_path / "maps.exr", intrinsics_channels(maps.replace(mask=None)))  # a notice is due on it
+    write_exr(tmp_path / "bare.exr", intrinsics_channels(maps.replace(roughness=None, albedo=None)))
+    named = {"BALL": ball, "MAPS": tmp_path / "maps.exr", "BARE": tmp_path / "bare.exr"}
+    named |= {"OLD": decomposed, "NEW": tmp_path / "new"}
+    assert run(*(named.get(word, word) for word in arguments)) != 0
+    printed = capsys.readouterr().err
+    assert (printed.count("\n"), printed[:17]) == (1, "unirender: error:")
+
+
 def test_the_working_directory_is_no_output(
     ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -79,7 +79,8 @@ def frame_remarks(mask: "np.ndarray", side: int, tile: bool) -> dict[str, str]:
 
 
 def with_frame_remarks(picture: "Picture", side: int, tile: bool) -> "Picture":
-    """A picture with those remarks among its others, and a notice of each.
+    """A picture with those remarks among its others, and a notice of each of all: nothing is refused any more that
+    would make them moot.
 
     Args:
         picture: with a mask.
@@ -87,10 +88,10 @@ def with_frame_remarks(picture: "Picture", side: int, tile: bool) -> "Picture":
         tile: likewise.
     """
     assert picture.mask is not None, "what is read for a command has one"
-    found = frame_remarks(picture.mask, side, tile)
-    for remark in found.values():
+    remarks = {**picture.remarks, **frame_remarks(picture.mask, side, tile)}
+    for remark in remarks.values():
         notice(remark)
-    return dataclasses.replace(picture, remarks={**picture.remarks, **found})
+    return dataclasses.replace(picture, remarks=remarks)
 
 
 def overflow(pipeline: "UniRenderPipeline", intrinsics: "Intrinsics") -> dict[str, Any]:
