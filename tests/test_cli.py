@@ -634,7 +634,11 @@ FAILURES = {
     "light": (["relight", "PICTURE", "--environment", "MISSING", "--output", "OUT"], "missing"),
     "maps": (["render", "FOLDER", "--output", "OUT"], "intrinsics.exr"),
     "no maps": (["render", "PICTURE", "--output", "OUT"], "no EXR file"),
-    "checkpoint": (["render", "MAPS", "--output", "OUT", "--checkpoint", "FOLDER"], "model_index.json"),
+    "incomplete maps": (["render", "MAPS", "--output", "OUT"], "normal, roughness, metallic missing"),
+    "checkpoint": (
+        ["edit", "PICTURE", "--output", "OUT", "--roughness", "0.5", "--checkpoint", "FOLDER"],
+        "model_index.json",
+    ),
     "data": (["train", "--data", "MISSING", "--out", "OUT"], "no such data folder"),
 }
 
