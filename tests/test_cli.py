@@ -346,7 +346,7 @@ def test_parts_of_the_mask_that_are_left_out_are_told(tmp_path: Path, capsys: py
     pixels[5, 5:7, 3] = 255
     (tmp_path / "pictures").mkdir()
     Image.fromarray(pixels).save(tmp_path / "pictures" / "a.png")
-    said = "2 pixels of the mask are taken for stray ones and left out"
+    said = "left out as stray: 2 pixels of the mask, in parts away from the object"
     assert run("decompose", tmp_path / "pictures" / "a.png", "--output", tmp_path / "out") == 0
     assert capsys.readouterr().err.count(said) == 1
     assert run("decompose", tmp_path / "pictures", "--output", tmp_path / "folder") == 0
@@ -534,6 +534,30 @@ def test_an_existing_folder_is_kept(ball: Path, tmp_path: Path, capsys: pytest.C
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("decompose", "BALL", "--output", "OLD"),
+        ("edit", "BALL", "--output", "NEW", "--metallic", "1", "--size", "65"),
+        ("relight", "BALL", "--output", "NEW", "--environment", "none.hdr"),
+        ("render", "MAPS", "--output", "NEW", "--fov", "30", "--checkpoint", "none"),
+        ("render", "BARE", "--output", "NEW", "--fov", "30"),
+    ],
+)
+def test_a_refusal_stands_alone(
+    arguments: tuple[str, ...], ball: Path, decomposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What a picture lacks is of no interest to whom it was refused."""
+    maps = read_result(decomposed)
+    write_exr(tmp_path / "maps.exr", intrinsics_channels(maps.replace(mask=None)))  # a notice is due on it
+    write_exr(tmp_path / "bare.exr", intrinsics_channels(maps.replace(roughness=None, albedo=None)))
+    named = {"BALL": ball, "MAPS": tmp_path / "maps.exr", "BARE": tmp_path / "bare.exr"}
+    named |= {"OLD": decomposed, "NEW": tmp_path / "new"}
+    assert run(*(named.get(word, word) for word in arguments)) != 0
+    printed = capsys.readouterr().err
+    assert (printed.count("\n"), printed[:17]) == (1, "unirender: error:")
+
+
 def test_the_working_directory_is_no_output(
     ball: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -601,11 +625,11 @@ USAGE = {
     "device": (["decompose", "PICTURE", "--output", "OUT", "--device", "tpu"], "tpu"),
     "exposure": (["relight", "PICTURE", "--environment", "L", "--output", "OUT", "--exposure", "99"], "stops"),
     "exposure of nothing": (["render", "FOLDER", "--output", "OUT", "--exposure", "1"], "--environment"),
-    "preset": (["train", "--data", "FOLDER", "--preset", "huge"], "expected one of: tiny"),
+    "preset": (["train", "--data", "FOLDER", "--preset", "huge"], "expected one of tiny"),
     "best of nothing": (["train", "--data", "FOLDER", "--keep-best", "albedo.psnr"], "--validate"),
     "best of another": (
         ["train", "--data", "FOLDER", "--out", "OUT", "--validate", "1", "--keep-best", "albedo.snr"],
-        "expected one of: albedo.psnr, normal.cosine, metallic.mse, roughness.mse, render.psnr, edit.psnr",
+        "expected one of albedo.psnr, normal.cosine, metallic.mse, roughness.mse, render.psnr, edit.psnr",
     ),
     "pairs": (["dataset", "--pairs", "5", "--out", "OUT"], "expected 3 x lights"),
 }
@@ -615,7 +639,11 @@ FAILURES = {
     "light": (["relight", "PICTURE", "--environment", "MISSING", "--output", "OUT"], "missing"),
     "maps": (["render", "FOLDER", "--output", "OUT"], "intrinsics.exr"),
     "no maps": (["render", "PICTURE", "--output", "OUT"], "no EXR file"),
-    "checkpoint": (["render", "MAPS", "--output", "OUT", "--checkpoint", "FOLDER"], "model_index.json"),
+    "incomplete maps": (["render", "MAPS", "--output", "OUT"], "normal, roughness, metallic missing"),
+    "checkpoint": (
+        ["edit", "PICTURE", "--output", "OUT", "--roughness", "0.5", "--checkpoint", "FOLDER"],
+        "model_index.json",
+    ),
     "data": (["train", "--data", "MISSING", "--out", "OUT"], "no such data folder"),
 }
 
@@ -751,7 +779,7 @@ def test_dataset_says_what_it_did(tmp_path: Path, capsys: pytest.CaptureFixture[
     arguments = ("--objects", "1", "--pairs", "3", "--resolution", "8", "--spp", "4", "--workers", "1")
     assert run("dataset", *arguments, "--out", tmp_path / "data") == 0
     printed = capsys.readouterr()
-    assert "3 pairs in 1 groups" in printed.out
+    assert "3 pairs in 1 group," in printed.out
     assert "% of it spent rendering" in printed.out
     assert "groups: 0 of 1\n" in printed.err, "a log shows that it goes on"
     assert run("dataset", *arguments, "--out", tmp_path / "data") == 0

@@ -39,6 +39,7 @@ VOCABULARY = {
         "system.machine",
         "system.run_progress",
         "system.whole_files",
+        "system.wording",
         "system.worker_pool",
         "system.writing",
         "vectors",

@@ -20,6 +20,7 @@ from jaxtyping import Float
 from unirender.arguments import as_floats
 from unirender.blocks import BLOCK
 from unirender.errors import UnirenderError
+from unirender.system.wording import meant, near
 
 Mask = Literal["masked", "whole"]
 Space = Literal["srgb", "linear"]
@@ -69,9 +70,11 @@ class Variant:
         for word in text.split("-"):
             found = [axis for axis, words in AXES.items() if word in words]
             if not found or found[0] in axes:
-                known = ", ".join((*MASKS, *SPACES, *SCALES))
+                known = (*MASKS, *SPACES, *SCALES)
+                close = [name for name in near(word, known) if name != word]
                 raise UnirenderError(
-                    f"variant {text!r}: got {word!r}, expected one word per axis of {known}, '-' between"
+                    f"variant {text!r}: got {word!r}, expected one word per axis of {', '.join(known)}, '-' between"
+                    f"{meant(close)}"
                 )
             axes[found[0]] = word
         return cls(**axes)  # pyright: ignore[reportArgumentType] - each word was looked up among its axis' values

@@ -89,6 +89,7 @@ OUTSIDE = (
     "system/notices",
     "system/run_progress",
     "system/system_errors",
+    "system/wording",
     "system/worker_pool",
     "system/writing",
 )

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.wording import counted
 
 if TYPE_CHECKING:
     from unirender_reference.dataset import GenerateReport
@@ -235,13 +236,12 @@ class Dataset:
 
     def _summary(self, report: "GenerateReport") -> str:
         if report.workers == 0:
-            return (
-                f"{self.out}: complete already, {report.skipped_shards} shards; manifest {report.manifest_sha256[:12]}"
-            )
+            there = counted(report.skipped_shards, "shard")
+            return f"{self.out}: complete already, {there}; manifest {report.manifest_sha256[:12]}"
         rendered = f"{1 / report.overhead:.0%} of it spent rendering" if report.render_seconds else "nothing rendered"
         return (
-            f"{self.out}: {report.samples} pairs in {report.groups} groups, {report.seconds:.1f} s on {report.workers} "
-            f"worker{'s' * (report.workers != 1)}, {rendered}; "
-            f"{report.skipped_shards} shards were there; {report.nan_pixels} NaN pixels rendered again; "
+            f"{self.out}: {counted(report.samples, 'pair')} in {counted(report.groups, 'group')}, "
+            f"{report.seconds:.1f} s on {counted(report.workers, 'worker')}, {rendered}; "
+            f"shards that were there: {report.skipped_shards}; NaN pixels rendered again: {report.nan_pixels}; "
             f"manifest {report.manifest_sha256[:12]}"
         )

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.wording import meant, near
 
 FOLDERS = ("meshes", "lights")  # options that are folders of the user's
 OPTIONS: Mapping[str, type] = {
@@ -78,8 +79,9 @@ def recipe_path(name_or_path: str) -> Path:
     folder = Path(str(resources.files("unirender_reference"))) / "data" / "recipes"
     path = folder / f"{name_or_path}.toml"
     if not path.is_file():
-        known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
-        raise UsageError(f"--recipe {name_or_path}: expected one of {known}, or the path of a .toml file")
+        known = sorted(p.stem for p in folder.glob("*.toml"))
+        expected = f"expected one of {', '.join(known)}, or the path of a .toml file"
+        raise UsageError(f"--recipe {name_or_path}: {expected}{meant(near(name_or_path, known))}")
     return path
 
 

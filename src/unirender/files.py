@@ -97,7 +97,8 @@ def new_folder(path: str | Path, *, overwrite: bool | None = None, tidy: bool = 
                 forget_half_made(path.parent, {path.name})
             temporary.mkdir()
         except OSError as error:
-            raise UnirenderError(f"{shown}: cannot be written ({error.strerror}); choose another folder") from error
+            reason = f"{path.parent} is no folder" if isinstance(error, FileExistsError) else error.strerror
+            raise UnirenderError(f"{shown}: cannot be written ({reason}); choose another folder") from error
         with naming(Path(shown)):
             yield temporary
         try:

@@ -94,15 +94,20 @@ def test_the_mark_stands_in_the_header_beside_the_others(tmp_path: Path) -> None
 
 
 def test_runs_of_old_radiance_files_are_named(tmp_path: Path) -> None:
-    """Two grey pixels and the first six times more; twins: the same pixels one by one, and cut off."""
+    """Two grey pixels and the second six times more; twins: the same pixels one by one, and cut off, also where some of
+    them are as dark as a run is written."""
     header, grey = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 4\n", bytes([128, 128, 128, 129])
     (tmp_path / "old.hdr").write_bytes(header + grey + grey + bytes([1, 1, 1, 6]))
     (tmp_path / "flat.hdr").write_bytes(header + 8 * grey)
     (tmp_path / "cut.hdr").write_bytes(header + 6 * grey)
-    with pytest.raises(UnirenderError, match=r"run-length coded as Radiance did before 1991.*save it as EXR"):
-        load_light(tmp_path / "old.hdr")
-    with pytest.raises(UnirenderError, match="read 0 out of"):
-        load_light(tmp_path / "cut.hdr")
+    (tmp_path / "dark.hdr").write_bytes(header + bytes([1, 1, 1, 120]) + 5 * grey)
+    (tmp_path / "long.hdr").write_bytes(header.replace(b"4", b"350") + grey + bytes([1, 1, 1, 187, 1, 1, 1, 2]))
+    for name in ("old", "long"):
+        with pytest.raises(UnirenderError, match=r"run-length coded as Radiance did before 1991.*save it as EXR"):
+            load_light(tmp_path / f"{name}.hdr")
+    for name in ("cut", "dark"):
+        with pytest.raises(UnirenderError, match="read 0 out of"):
+            load_light(tmp_path / f"{name}.hdr")
     assert np.allclose(load_light(tmp_path / "flat.hdr", normalise=False).environment, 1, atol=0.01)
 
 

@@ -116,6 +116,23 @@ def test_a_folder_is_listed_with_reasons_and_what_looks_alike(
     assert said.count("Alike across the splits") == 2
 
 
+def test_a_light_is_named_as_it_is_typed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`--environment` takes files; a name like a-hall-png is none."""
+    monkeypatch.setenv("COLUMNS", "200")
+    (tmp_path / "a").mkdir()
+    Image.fromarray(np.full((16, 32, 3), 90, np.uint8)).save(tmp_path / "a" / "[red]hall.png")
+    (tmp_path / "broken.hdr").write_bytes(b"no map")
+    assert Lights(pool=tmp_path, split="train").run() == 1
+    said = capsys.readouterr().out
+    assert "1 light of 64 x 128 texels" in said
+    assert f"\nA light is used by its file: --environment '{tmp_path}/a/[red]hall.png'.\n" in said
+    assert f"\nNo light (train): {tmp_path}/broken.hdr: " in said
+    assert Lights(split="test").run() == 0
+    assert "--environment 'FOLDER/blender-city.exr', once --export FOLDER has written it." in capsys.readouterr().out
+
+
 def test_a_draw_names_the_files_it_passed_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Image.new("RGB", (40, 20), (90, 80, 70)).save(tmp_path / "good.png")
     (tmp_path / "bad.png").write_bytes(b"hello")

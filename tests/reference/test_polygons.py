@@ -96,6 +96,22 @@ def test_stars_of_any_radii_are_filled(radii: list[float], start: int) -> None:
     assert np.abs(found).sum() == pytest.approx(area(flat), rel=5e-3)
 
 
+@pytest.mark.parametrize("corners", [4, 5, 9])
+def test_many_polygons_are_cut_as_each_is_alone(corners: int) -> None:
+    """Those of one size together: 100,000 arrows one by one took a minute. Some cut themselves, some are in twice."""
+    rng = np.random.default_rng(corners)
+    angles = np.sort(rng.uniform(0, 2 * np.pi, (60, corners)), axis=1)
+    radii = rng.uniform(0.1, 1, (60, corners))
+    rings = np.stack([radii * np.cos(angles), radii * np.sin(angles), 0.01 * radii], axis=2)
+    rings[::9] = rng.normal(size=rings[::9].shape)
+    rings[1::9] = rings[::9][: len(rings[1::9]), ::-1]
+    together, polygon = triangulate(rings.reshape(-1, 3), np.full(60, corners))
+    assert not np.array_equal(together, fans(np.full(60, corners))[0])
+    for p in np.setdiff1d(np.arange(60), np.arange(1, 60, 9)):  # the second of a pair begins as the first does
+        alone, _ = triangulate(rings[p], np.array([corners]))
+        np.testing.assert_array_equal(together[polygon == p], alone + p * corners)
+
+
 def test_many_small_notches_count_together():
     """Each of them alone is below what is taken for rounding; the fan covered three times the polygon."""
     angles = np.arange(8000) * 2 * np.pi / 8000

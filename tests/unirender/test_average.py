@@ -195,7 +195,7 @@ def test_schedules_may_differ_by_rounding_only(checkpoints: tuple[Path, Path], t
 @pytest.mark.parametrize(
     ("count", "shares", "said"),
     [
-        (1, (), "got 1 checkpoints, expected two or more"),
+        (1, (), "got 1 checkpoint, expected two or more"),
         (2, (1.0,), "--shares: got 1, expected 2"),
         (2, (1.0, 0.0), "expected finite numbers above 0"),
         (2, (1.0, -1.0), "expected finite numbers above 0"),

@@ -65,6 +65,11 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[object, s
             "--light: no option of `unirender relight`; did you mean --environment? "
             "`unirender relight --help` lists what it takes",
         ),
+        (
+            ["lights", "--output", "x"],
+            "--output: no option of `unirender lights`; did you mean --export? "
+            "`unirender lights --help` lists what it takes",
+        ),
         (["optimise"], "optimise: no command of `unirender`; did you mean optimize? `unirender --help` lists them"),
         (
             ["bench", "tabels", "--out", "x"],
@@ -172,22 +177,51 @@ def test_letters_that_the_output_lacks_are_printed_by_their_number(monkeypatch: 
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "said_of_it"),
+    ("arguments", "line"),
     [
-        ("--metallic", "much", "--metallic: got 'much', expected a number."),  # None where it is not given
-        ("--samples", "1.5", "--samples: got '1.5', expected a whole number."),
-        ("--sampler", "euler", "invalid choice 'euler' for argument '--sampler'. Expected one of ('ddim', 'unipc')."),
+        (["edit", "x.png", "--output", "y", "--metallic", "much"], "--metallic much: expected a number"),
+        (["edit", "x.png", "--output", "y", "--samples=1.5"], "--samples 1.5: expected a whole number"),
+        (["figures", "--values", "0", "o.5", "--out", "y"], "--values o.5: expected a number"),
+        (["edit", "x.png", "--output", "y", "--sampler", "euler"], "--sampler euler: expected one of ddim, unipc"),
+        (
+            ["optimize", "x", "--out", "y", "--init", "unirendr"],
+            "--init unirendr: expected one of none, unirender; did you mean unirender?",
+        ),
+        (
+            ["bench", "ls", "Tabels"],
+            "Tabels: expected one of suites, tables, methods, metrics, variants; did you mean tables?",
+        ),
+        (
+            ["bench", "speed", "--parts", "start", "netwrk"],
+            "--parts netwrk: expected one of network, mitsuba, start, training, overfit; did you mean network?",
+        ),
+        (["edit", "x.png", "--output", "--metallic", "1"], "--output: expected a value after it, got none"),
     ],
 )
-def test_a_value_of_another_kind_is_told_without_pythons_words(
-    option: str, value: str, said_of_it: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("columns", ["40", "120"])
+def test_what_is_no_value_of_an_option(
+    arguments: list[str],
+    line: str,
+    columns: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "120")
-    status, text = said(capsys, "edit", "x.png", "--output", "y", option, value)
-    assert status == 2
-    assert said_of_it in text
-    assert "NoneType" not in text
-    assert "{None}" not in text
+    """One line as elsewhere, not a box that ends with the help of `unirender` alone."""
+    monkeypatch.setenv("COLUMNS", columns)
+    assert said(capsys, *arguments) == (2, f"unirender: error: {line}\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "end"),
+    [
+        (["train", "--data", "x", "--preset", "tinny"], "did you mean tiny?"),
+        (["bench", "run", "--suite", "Standrd"], "did you mean standard?"),
+        (["dataset", "--recipe", "train-46", "--out", "y"], "did you mean train-64 or train-128?"),
+        (["bench", "tables", "--variant", "masked-liner", "x"], "did you mean linear or aligned?"),
+    ],
+)
+def test_a_name_that_is_nearly_right(arguments: list[str], end: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert said(capsys, *arguments)[1].endswith(f"; {end}\n")
 
 
 def test_an_option_may_be_none_where_its_default_is_another(capsys: pytest.CaptureFixture[str]) -> None:

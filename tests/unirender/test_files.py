@@ -180,6 +180,12 @@ def test_the_working_directory_is_not_replaced(given: str, tmp_path: Path, monke
     assert [path.name for path in Path.cwd().iterdir()] == ["new"]
 
 
+def test_a_folder_below_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(UnirenderError, match="/file is no folder"), new_folder(tmp_path / "file/a"):
+        pass
+
+
 def test_an_empty_folder_and_a_link_to_one_are_filled(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to("real")

@@ -24,6 +24,7 @@ from unirender.scene_export.mitsuba_scene import MOST_VERTICES, ply_bytes
 FILES = {
     *("card.gltf", "base_color.png", "metallic_roughness.png", "normal.png", "meta.json"),
     *("scene.xml", "card.ply", "roughness.png", "metallic.png", "opacity.png", "environment.exr", "latlong.exr"),
+    "environment.pfm",
 }
 
 
@@ -112,6 +113,8 @@ def test_the_light_is_stored_as_it_is(intrinsics: Intrinsics, tmp_path: Path) ->
     export_scene(tmp_path / "scene", intrinsics)
     stored = channels_rgb(read_exr(tmp_path / "scene" / "environment.exr")[0])
     np.testing.assert_array_equal(stored, intrinsics.require("environment")["environment"])
+    texels = (tmp_path / "scene" / "environment.pfm").read_bytes()[-stored.nbytes :]
+    np.testing.assert_array_equal(np.frombuffer(texels, "<f4").reshape(stored.shape)[::-1], stored)
     meta = json.loads((tmp_path / "scene" / "meta.json").read_text())
     assert (meta["fov_deg"], meta["width"], meta["distance"]) == (40.0, 16, Camera(40.0).distance())
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Protocol, TypeVar, runtime_checkable
 
 from unirender.errors import UsageError
+from unirender.system.wording import meant, near
 
 
 @runtime_checkable
@@ -38,5 +39,6 @@ def chosen(rows: Sequence[Row], names: Sequence[str], option: str) -> tuple[Row,
     if unknown := [name for name in names if name not in (*known, *groups)]:
         raise UsageError(
             f"{option} {' '.join(unknown)}: expected some of {', '.join(known)}, or the groups {', '.join(groups)}"
+            f"{meant(near(unknown[0], [*known, *groups]))}"
         )
     return tuple(row for row in rows if not names or not row.group or {row.name, row.group} & set(names))

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from unirender.arguments import as_path
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
+from unirender.system.wording import meant, near
 from unirender_evaluation.suites.check import value_problems
 from unirender_evaluation.suites.stratification import MetallicRoughness, stratified_materials
 
@@ -138,8 +139,9 @@ def suite_path(name_or_path: str | Path) -> Path:
         return path
     bundled = suite_folder() / f"{name_or_path}.toml"
     if not bundled.is_file():
-        known = ", ".join(sorted(p.stem for p in bundled.parent.glob("*.toml")))
-        raise UnirenderError(f"no suite {str(name_or_path)!r}: expected one of {known}, or the path of a .toml file")
+        known = sorted(p.stem for p in bundled.parent.glob("*.toml"))
+        expected = f"expected one of {', '.join(known)}, or the path of a .toml file"
+        raise UnirenderError(f"no suite {str(name_or_path)!r}: {expected}{meant(near(str(name_or_path), known))}")
     return bundled
 
 

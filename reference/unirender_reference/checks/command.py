@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from unirender.errors import UsageError
+from unirender.system.wording import one_of
 from unirender_reference.measure.output import check_file, write_file
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class Check:
         if self.seed < 0:
             raise UsageError(f"--seed: got {self.seed}, expected 0 or more")
         if self.perturb is not None and self.perturb not in PERTURBATIONS:
-            raise UsageError(f"--perturb: got {self.perturb}, expected one of {', '.join(PERTURBATIONS)}")
+            raise UsageError(f"--perturb: got {self.perturb}, {one_of(self.perturb, PERTURBATIONS)}")
         if self.twins and self.perturb is not None:
             raise UsageError("--twins runs every perturbation: leave --perturb out")
         if self.json is not None and not self.json.absolute().parent.is_dir():

@@ -228,12 +228,20 @@ def _read_hdr(path: Path) -> tuple[Float[np.ndarray, "h w 3"], dict[str, str]]:
 
 
 def _has_old_runs(path: Path) -> bool:
-    """Whether a Radiance file repeats pixels by others of 1, 1, 1 and a count."""
+    """Whether a Radiance file repeats pixels by others of 1, 1, 1 and a count, and has all of them then.
+
+    Of such pixels in a row each has the next eight bits of the count.
+    """
     data = path.read_bytes()
     header = SIZES.match(data[:MOST_HEADER_BYTES])
-    start = header.end() if header else len(data)
-    pixels = np.frombuffer(data, np.uint8, (len(data) - start) // 4 * 4, start).reshape(-1, 4)[:, :3]
-    return not data.startswith(NEW_RUNS, start) and bool((pixels == 1).all(axis=1).any())
+    if header is None or header[1] is None or data.startswith(NEW_RUNS, header.end()):
+        return False
+    start = header.end()
+    pixels = np.frombuffer(data, np.uint8, (len(data) - start) // 4 * 4, start).reshape(-1, 4)
+    run, place = (pixels[:, :3] == 1).all(axis=1), np.arange(len(pixels))
+    digit = place - np.maximum.accumulate(np.where(run, -1, place)) - 1  # of a count, from the lowest
+    lengths = np.where(run, pixels[:, 3] * 256.0 ** np.minimum(digit, 4), 1)
+    return bool(run.any() and lengths.sum() == int(header[1]) * int(header[2]))
 
 
 def _as_its_header_says(pixels: Float[np.ndarray, "h w 3"], path: Path) -> Float[np.ndarray, "h w 3"]:

@@ -21,6 +21,7 @@ import numpy as np
 
 from unirender.arguments import check_switches
 from unirender.errors import UnirenderError
+from unirender.system.wording import counted
 from unirender_reference.lights.files import HDR_SUFFIXES, load_light
 from unirender_reference.lights.light import SHAPE, Light
 
@@ -136,7 +137,7 @@ def light_pool(
         least = holdout if split == "test" else 1
         lower = f"lower --light-holdout (`unirender lights`: --holdout) to at most {places}, or " if places > 1 else ""
         raise UnirenderError(
-            f"lights {folder}: no maps or photographs for the {split} side, expected at least {least} places"
+            f"lights {folder}: no maps or photographs for the {split} side, expected at least {counted(least, 'place')}"
             f"{f' (one in {holdout} is for test)' if split == 'test' else ''}, got {places}; {lower}add files"
         )
     return LightPool(Path(folder), split, names, share, turn, height)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.wording import counted
 from unirender_reference.measure.output import check_file, png_bytes, write_file
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ class Sheet:
             rows.append(buffer_tiles(render_sample(spec, self.spp), style.background))
             labels.append(_label(spec))
         write_file("--out", self.out, png_bytes(table_sheet(rows, labels, COLUMNS, style)))
-        print(f"{self.out}: {len(rows)} objects x {len(COLUMNS)} buffers, {self.spp} spp")
+        print(f"{self.out}: {counted(len(rows), 'object')} x {len(COLUMNS)} buffers, {self.spp} spp")
         return 0
 
     def specs(self) -> "Iterator[SceneSpec]":

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UsageError
+from unirender.system.wording import counted
 from unirender.system.worker_pool import WorkerPool
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ class Cost:
             f"means over {self.scenes} scene{'s' * (self.scenes != 1)}."
         )
         console.print(whole)
-        console.print(f"{self.objects:,} objects x {PAIRS} pairs, {SHARD_GROUPS} groups a shard.")
+        console.print(f"{counted(self.objects, 'object')} x {PAIRS} pairs, {SHARD_GROUPS} groups a shard.")
         return 0
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from unirender.errors import UsageError
+from unirender.system.wording import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -73,7 +74,8 @@ class Exposure:
             groups[kind] = [scene for scene in scenes if scene.light == kind]
         for title, (low, high) in BANDS.items():
             groups[title] = [scene for scene in scenes if low <= scene.metallic < high]
-        title = f"{len(scenes)} scenes, {RESOLUTION} px, {self.spp} spp, split {self.split}, seed {self.seed}"
+        how = f"{RESOLUTION} px, {self.spp} spp, split {self.split}, seed {self.seed}"
+        title = f"{counted(len(scenes), 'scene')}, {how}"
         table = Table(*HEADERS, title=title, box=box.SIMPLE)
         for title, group in groups.items():
             if group:

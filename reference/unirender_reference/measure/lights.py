@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.wording import counted
 from unirender.system.writing import writing
 from unirender_reference.measure.output import ELSEWHERE, check_file, png_bytes, write_file
 
@@ -145,7 +146,7 @@ class Lights:
             console.print(_kinds_table(found["kinds"]))
         console.print(_lights_table(found["lights"]))
         for failure in found["failures"]:
-            console.print(f"{failure['split']}: no light: {failure['reason']}", highlight=False, markup=False)
+            print(f"No light ({failure['split']}): {failure['reason'].removeprefix('light ')}")
         for rank, pair in enumerate(found.get("alike", [])):
             if rank == 0 or pair["likeness"] >= SAME_PLACE:
                 console.print(
@@ -153,7 +154,12 @@ class Lights:
                     f"{pair['likeness']:.2f}; one place has {SAME_PLACE:g} or more."
                 )
         for note in found["notes"]:
-            console.print(note, highlight=False, markup=False)
+            print(note)
+        if found["lights"] and not self.draw:
+            first, folder = found["lights"][0], self.pool or self.export
+            path = (folder or Path("FOLDER")) / (first["provenance"]["file"] if self.pool else f"{first['name']}.exr")
+            written = "" if folder else ", once --export FOLDER has written it"
+            print(f"A light is used by its file: --environment '{path}'{written}.")
 
 
 @dataclass
@@ -230,13 +236,15 @@ def _lights_table(rows: list[dict[str, Any]]) -> "Table":
     """One line a light. All means are 1, so only the peak differs: the largest luminance, in units of the mean."""
     from rich import box
     from rich.table import Table
+    from rich.text import Text
 
     sizes = " or ".join(sorted({"{} x {}".format(*row["size"]) for row in rows}))
-    title = f"{len(rows)} lights of {sizes} texels, mean luminance 1"
+    title = f"{counted(len(rows), 'light')} of {sizes} texels, mean luminance 1"
     table = Table(title=title, box=box.SIMPLE)
     for name in ("light", "split", "peak / mean", "sha256"):
         table.add_column(name, no_wrap=True, justify="right" if name == "peak / mean" else "left")
     table.add_column("about", overflow="fold")
     for row in rows:
-        table.add_row(row["name"], row["split"], f"{row['peak_ratio']:.0f}", row["sha256"][:8], row["about"])
+        name = Text(row["provenance"].get("file", row["name"]))  # a file's name is no markup
+        table.add_row(name, row["split"], f"{row['peak_ratio']:.0f}", row["sha256"][:8], row["about"])
     return table

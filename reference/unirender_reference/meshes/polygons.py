@@ -35,11 +35,7 @@ def triangulate(
     points = points[begun]
     folded = _folded(points, sizes, triangles, polygon)
     check_corners(int(sizes[folded].max(initial=0)))
-    cuts: dict[int, Int[np.ndarray, "m 3"] | None] = {}
-    for p, q in zip(folded.tolist(), earliest[folded].tolist(), strict=True):
-        ring, before = (points[first[own] : first[own] + sizes[own]] for own in (p, q))
-        turned_over = q in cuts and np.array_equal(ring[1:], before[:0:-1])
-        cuts[p] = _turned_over(cuts[q], len(ring)) if turned_over else _other_cut(ring)
+    cuts = _cuts(points, sizes, folded, earliest)
     found = {p: cut + first[p] for p, cut in cuts.items() if cut is not None}
     if not found:
         return begun[triangles], polygon
@@ -50,9 +46,26 @@ def triangulate(
     return begun[triangles[order]], polygon[order]
 
 
-def _turned_over(cut: Int[np.ndarray, "m 3"] | None, corners: int) -> Int[np.ndarray, "m 3"] | None:
-    """The same triangles of the polygon that begins at the same corner and goes round the other way."""
-    return None if cut is None else -cut[:, ::-1] % corners
+def _cuts(
+    points: Float[np.ndarray, "k 3"],
+    sizes: Int[np.ndarray, " p"],
+    folded: Int[np.ndarray, " q"],
+    earliest: Int[np.ndarray, " p"],
+) -> dict[int, Int[np.ndarray, "m 3"] | None]:
+    """Of the folded polygons, the triangles that fill each, by rows of its corners; None where none do."""
+    first = np.cumsum(sizes) - sizes
+    cuts: dict[int, Int[np.ndarray, "m 3"] | None] = {}
+    for size in np.unique(sizes[folded]).tolist():
+        alike = folded[sizes[folded] == size]
+        before = earliest[alike]
+        rings, rings_before = (points[first[own, None] + np.arange(size)] for own in (alike, before))
+        same = (rings[:, 1:] == rings_before[:, :0:-1]).all(axis=(1, 2))
+        turned_over = same & (before < alike) & np.isin(before, folded)
+        cuts |= zip(alike[~turned_over].tolist(), _other_cuts(rings[~turned_over]), strict=True)
+        for p, q in zip(alike[turned_over].tolist(), before[turned_over].tolist(), strict=True):
+            cut = cuts[q]  # begins at the same corner and goes round the other way
+            cuts[p] = None if cut is None else -cut[:, ::-1] % size
+    return cuts
 
 
 def _begun_alike(
@@ -98,7 +111,7 @@ def _folded(
 ) -> Int[np.ndarray, " q"]:
     """Polygons of four corners and more of whose fan some triangles are turned against the whole."""
     several: Bool[np.ndarray, " m"] = sizes[polygon] > 3
-    areas, owner = _doubled_areas(points, triangles[several]), polygon[several]
+    areas, owner = _doubled_areas(points[triangles[several]]), polygon[several]
     whole = np.zeros((len(sizes), 3))
     np.add.at(whole, owner, areas)
     with np.errstate(over="ignore", invalid="ignore"):  # broken coordinates are refused later
@@ -107,25 +120,32 @@ def _folded(
         return np.flatnonzero(turned > FOLDED * (whole**2).sum(-1))
 
 
-def _other_cut(points: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, "m 3"] | None:
-    """The triangles that fill one concave polygon, by rows of its corners; None where none do."""
-    fan, _ = fans(np.array([len(points)]))
-    normal = _doubled_areas(points, fan).sum(0)
-    area = float(np.linalg.norm(normal))
-    if not (np.isfinite(area) and area > 0):
-        return None
-    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    flat = (points - points[0]) @ np.stack([across, np.cross(normal, across) / area], axis=1)
-    cut = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), np.array([len(flat)], np.uint32))
-    triangles = cut.reshape(-1, 3).astype(np.int64)
-    turned = (_doubled_areas(points, triangles) * normal).sum(-1) < 0
-    triangles[turned] = triangles[turned, ::-1]
-    filled = np.abs((_doubled_areas(points, triangles) * normal).sum(-1)).sum() / area
-    return triangles if abs(filled - area) <= SAME_AREA * area else None
+def _other_cuts(rings: Float[np.ndarray, "g n 3"]) -> list[Int[np.ndarray, "m 3"] | None]:
+    """The triangles that fill each of some concave polygons, by rows of its corners; None where none do."""
+    found: list[Int[np.ndarray, "m 3"] | None] = [None] * len(rings)
+    fan, _ = fans(np.array([rings.shape[1]]))
+    normals = _doubled_areas(rings[:, fan]).sum(1)
+    areas = np.array([np.linalg.norm(normal) for normal in normals])
+    usable = np.flatnonzero(np.isfinite(areas) & (areas > 0))
+    rings, normals, areas = rings[usable], normals[usable], areas[usable]
+    across = np.cross(normals, np.eye(3)[np.abs(normals).argmin(1)])
+    flat = (rings - rings[:, :1]) @ np.stack([across, np.cross(normals, across) / areas[:, None]], axis=2)
+    end = np.array([rings.shape[1]], np.uint32)
+    cuts = [mapbox_earcut.triangulate_float64(plane, end).reshape(-1, 3).astype(np.int64) for plane in flat]
+    counts = np.array([len(cut) for cut in cuts], np.int64)
+    for count in np.unique(counts):
+        alike = np.flatnonzero(counts == count)
+        triangles = np.stack([cuts[i] for i in alike])
+        along = (_doubled_areas(rings[alike[:, None, None], triangles]) * normals[alike, None]).sum(-1)
+        triangles = np.where((along < 0)[..., None], triangles[..., ::-1], triangles)
+        filled = np.abs(along).sum(-1) / areas[alike]
+        for place in np.flatnonzero(np.abs(filled - areas[alike]) <= SAME_AREA * areas[alike]):
+            found[usable[alike[place]]] = triangles[place]
+    return found
 
 
-def _doubled_areas(points: Float[np.ndarray, "k 3"], triangles: Int[np.ndarray, "m 3"]) -> Float[np.ndarray, "m 3"]:
-    """Normals as long as twice the triangles' areas."""
-    a, b, c = np.moveaxis(points[triangles], 1, 0)
+def _doubled_areas(corners: Float[np.ndarray, "*m 3 3"]) -> Float[np.ndarray, "*m 3"]:
+    """Normals of triangles as long as twice their areas."""
+    a, b, c = np.moveaxis(corners, -2, 0)
     with np.errstate(over="ignore", invalid="ignore"):
         return np.cross(b - a, c - a)

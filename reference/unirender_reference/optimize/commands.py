@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.wording import counted
 from unirender.system.writing import writing
 from unirender_reference.measure.output import ELSEWHERE, full_disk
 from unirender_reference.optimize.machine import require_cores
@@ -137,7 +138,7 @@ class Optimize:
         from unirender_reference.optimize.files.export import SOLUTION_FILE
         from unirender_reference.optimize.multiview.run import optimize
         from unirender_reference.optimize.show.live import live_report
-        from unirender_reference.optimize.show.report import refinement_note
+        from unirender_reference.optimize.show.report import refinement_note, views_note
 
         views, obj, place = self.read()
         with live_report(Console(stderr=True, quiet=not self.progress)) as report:
@@ -159,11 +160,12 @@ class Optimize:
         record = json.loads((self.out / SOLUTION_FILE).read_text(encoding="utf-8"))
         figures = ", ".join(f"{name.removesuffix('_psnr_db')} {db:.2f} dB" for name, db in record["figures"].items())
         print(
-            f"{self.out}: {len(views.seen)} views, {record['seconds']:.1f} s; masked PSNR of the pictures: {figures}; "
-            f"IoU of the masks: {record['mask_iou']:.3f}"
+            f"{self.out}: {counted(len(views.seen), 'view')}, {record['seconds']:.1f} s; masked PSNR of the pictures: "
+            f"{figures}; IoU of the masks: {record['mask_iou']:.3f}"
         )
-        if note := refinement_note(record["stages"]):
-            print(note)
+        for note in (refinement_note(record["stages"]), views_note(record["figures"])):
+            if note is not None:
+                print(note)
         return 0
 
     def read(self) -> "tuple[Views, MeshObject | None, Sphere]":
@@ -214,40 +216,41 @@ class Optimize:
         from unirender_reference.optimize.single.render import rerendered
         from unirender_reference.optimize.single.run import optimize_image
 
-        given = read_picture_input(self.input, self.mask, self.fov, self.normal, self.size)
         obj = None
         if self.mesh is not None:
             from unirender_reference.meshes import load_mesh
 
             obj = load_mesh(self.mesh)
-        if predict is not None and given.hdr:
-            raise UsageError(
-                "--init unirender: the model sees display pictures, and this one is linear (EXR); leave it out"
-            )
         steps: list[Step] = []
         console = Console(stderr=True, quiet=not self.progress)
-        with new_folder(self.out, overwrite=self.overwrite) as folder, live_report(console) as report:
+        with new_folder(self.out, overwrite=self.overwrite) as folder:
+            given = read_picture_input(self.input, self.mask, self.fov, self.normal, self.size)
+            if predict is not None and given.hdr:
+                raise UsageError(
+                    "--init unirender: the model sees display pictures, and this one is linear (EXR); leave it out"
+                )
+            with live_report(console) as report:
 
-            def on_step(step: "Step") -> None:
-                steps.append(step)
-                report(Report(step, 1, 1, None, None))
+                def on_step(step: "Step") -> None:
+                    steps.append(step)
+                    report(Report(step, 1, 1, None, None))
 
-            began = time.perf_counter()
-            start = None if predict is None else predict(given.image, given.mask, given.camera)
-            priors, trust = self.single.resolved(obj is not None, start is not None)
-            config = dataclasses.replace(self.single, priors=priors, trust=trust)
-            found = optimize_image(
-                given.image,
-                given.mask,
-                given.camera,
-                config,
-                normal=given.normal,
-                geometry=obj,
-                init=start,
-                hdr=given.hdr,
-                clipped=given.clipped,
-                on_step=on_step,
-            )
+                began = time.perf_counter()
+                start = None if predict is None else predict(given.image, given.mask, given.camera)
+                priors, trust = self.single.resolved(obj is not None, start is not None)
+                config = dataclasses.replace(self.single, priors=priors, trust=trust)
+                found = optimize_image(
+                    given.image,
+                    given.mask,
+                    given.camera,
+                    config,
+                    normal=given.normal,
+                    geometry=obj,
+                    init=start,
+                    hdr=given.hdr,
+                    clipped=given.clipped,
+                    on_step=on_step,
+                )
             seconds = time.perf_counter() - began
             again = rerendered(given, found, obj, self.input.name)
             meta = {"command": "optimize", "input": self.input, "init": self.init, "hdr": given.hdr, "mesh": self.mesh}

@@ -5,6 +5,7 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from unirender.errors import UsageError
+from unirender.system.wording import one_of
 
 
 def require_least(options: Any, group: str, least: Mapping[str, float], above: bool = False) -> None:
@@ -45,4 +46,4 @@ def require_one_of(options: Any, group: str, choices: Mapping[str, Collection[st
         value = getattr(options, name)
         if value not in names:
             option = f"--{group}.{name.replace('_', '-')}"
-            raise UsageError(f"{option} {value!s:.40}: expected one of {', '.join(names)}")
+            raise UsageError(f"{option} {value!s:.40}: {one_of(str(value), names)}")

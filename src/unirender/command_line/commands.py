@@ -125,7 +125,7 @@ class Render:
         """Returns the exit status."""
         from unirender.files import new_folder, read_result, write_result
         from unirender.pipelines.editing import under_light
-        from unirender.pipelines.inputs import ready_to_render, to_derive, told_derived, with_mask
+        from unirender.pipelines.inputs import RENDER_NEEDS, ready_to_render, to_derive, told_derived, with_mask
 
         self.model.check()
         check_stops(self.exposure)
@@ -133,19 +133,20 @@ class Render:
             raise UsageError(f"--exposure {self.exposure:g} is of a new light: expected --environment beside it")
         remarks = self._memory_remarks()
         intrinsics = read_result(self.maps, self.model.fov, light=self.environment is None)
+        intrinsics.require(*RENDER_NEEDS)
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
+            light = None if self.environment is None else exposed_light(read_light, self.environment, self.exposure)
+            pipeline = self.model.load()
             meta: dict[str, Any] = {"command": "render", "input": self.maps}
             meta |= missing_maps(intrinsics, self.environment is not None)
             intrinsics = with_mask(intrinsics)
             meta |= normals_away(intrinsics)
-            if self.environment is not None:
-                light, rule = exposed_light(read_light, self.environment, self.exposure)
-                intrinsics = under_light(intrinsics, light, rule, shadows=self.shadows)
+            if light is not None:
+                intrinsics = under_light(intrinsics, *light, shadows=self.shadows)
                 meta |= {"light": self.environment, "exposure_stops": self.exposure}
             of_light = to_derive(intrinsics) if self.environment is None else ("specular", "diffuse")
             if of_light:
                 meta["shadows"] = self.shadows  # of what is derived; of maps that are given nobody is asked
-            pipeline = self.model.load()
             meta["remarks"] = remarks | parts_left_out(intrinsics.mask, self.model.side(pipeline))
             for remark in meta["remarks"].values():
                 notice(remark)

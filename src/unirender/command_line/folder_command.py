@@ -17,6 +17,7 @@ from unirender.pictures import Picture
 from unirender.pipelines.inputs import as_picture
 from unirender.pipelines.results import Decomposition
 from unirender.system.notices import notice
+from unirender.system.wording import counted
 
 if TYPE_CHECKING:
     from unirender.command_line.commands import Decompose
@@ -137,7 +138,7 @@ def say_result(output: Path, found: FolderResult, changes: dict[str, float] | No
     for reason in found.failed.values():
         notice(f"error: {reason}")
     failed = f", {len(found.failed)} failed" if found.failed else ""
-    print(f"{output}: {len(found.figures)} pictures ({found.kept} of them from before){failed}")
+    print(f"{output}: {counted(len(found.figures), 'picture')} ({found.kept} of them from before){failed}")
     if changes is not None:
         shown = ", ".join(f"{name} {value:.4f}" for name, value in changes.items() if name != "pairs")
-        print(f"mean change between {changes['pairs']} pairs of frames: {shown or 'none to compare'}")
+        print(f"mean change between {counted(int(changes['pairs']), 'pair')} of frames: {shown or 'none to compare'}")

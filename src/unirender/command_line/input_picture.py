@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from unirender.errors import UnirenderError
 from unirender.system.machine import memory_excess, needs_swap
+from unirender.system.wording import counted
 
 if TYPE_CHECKING:
     from unirender.pictures import Picture
@@ -65,7 +66,7 @@ def read_input(
             "the mask holds all four corners of the frame, expected white on the object: is it inverted?"
         )
     if (pixels := int(covered.sum())) < FEW_PIXELS:
-        remarks["small"] = f"the object covers {'1 pixel' if pixels == 1 else f'{pixels} pixels'}: its maps mean little"
+        remarks["small"] = f"the object covers {counted(pixels, 'pixel')}: its maps mean little"
     if (most := picture.mask.max()) < FULL_COVERAGE:
         remarks["coverage"] = f"the mask is at most {most:.2f}, as of something transparent: expected 1 on the object"
     if (bright := float(np.percentile(picture.image_srgb[covered].max(axis=-1), 99))) < DARK:

@@ -16,7 +16,6 @@ from unirender.command_line.input_picture import (
 )
 from unirender.command_line.option_checks import at_least, usage
 from unirender.errors import UsageError
-from unirender.system.notices import notice
 
 if TYPE_CHECKING:
     import torch
@@ -233,14 +232,12 @@ class InputOptions:
         return {"input": self.picture, "mask": self.mask}
 
     def read(self, model: ModelOptions, bytes_a_pixel: int) -> tuple["Picture", "Camera"]:
-        """The picture with a mask and its remarks, and its camera; notices say them: what was assumed, and what the
-        picture cannot show. `bytes_a_pixel` as of `read_input`.
+        """The picture with a mask and its remarks (what was assumed, and what it cannot show), and its camera.
+        `bytes_a_pixel` as of `read_input`.
 
         Raises:
             UnirenderError: as `read_input`.
         """
         picture, remarks = read_input(self.picture, self.mask, bytes_a_pixel=bytes_a_pixel, samples=model.samples)
         remarks |= model.camera_remarks(picture)
-        for remark in remarks.values():
-            notice(remark)
         return dataclasses.replace(picture, remarks=remarks), model.camera(picture)

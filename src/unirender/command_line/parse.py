@@ -1,7 +1,6 @@
 """A command line as the command that it asks for, or one sentence on what is wrong with it. Light to import."""
 
 import contextlib
-import difflib
 import io
 import itertools
 import re
@@ -11,14 +10,24 @@ from typing import Any
 import docstring_parser
 import tyro
 
-from unirender.command_line.option_values import registry
+from unirender.command_line.option_values import WrongValue, registry
 from unirender.errors import UnirenderError, UsageError
 from unirender.system.ends import causes
+from unirender.system.wording import meant, near
 
 OPTION = re.compile(r"(?<![\w.-])--[a-z][\w.-]*")
-SYNONYMS = {"size": "resolution", "resolution": "size", "light": "environment", "model": "checkpoint"}
+SYNONYMS = {
+    "size": ("resolution",),
+    "resolution": ("size",),
+    "light": ("environment",),
+    "model": ("checkpoint",),
+    "output": ("out", "export"),
+    "out": ("output", "export"),
+}
 COMMANDS = re.compile(r"\[-h\] \{([\w,-]+)\}$")  # of a usage line; not the choices of an option
 BORDER = "\N{BOX DRAWINGS LIGHT VERTICAL}"  # of the boxes of a help, where a stream can print it
+REFUSED = re.compile(r"Error parsing (--[\w.-]+)?")  # tyro, of a wrong value; its option
+MISSING = re.compile(r"Missing value for argument '(--[\w.-]+)'")
 LINE_BREAK = re.compile(r"(?<!\n)\n[ ]*(?![ \n]|- )")  # of a sentence: no empty line, no item of a list
 
 
@@ -56,8 +65,9 @@ def _check_empty(argv: Sequence[str]) -> None:
 
 def _parsed(commands: Any, words: list[str], prog: str, description: str) -> Any:
     """The command of the words; of an error, the one of ours that caused it, or else tyro's own message."""
+    printed = io.StringIO()
     try:
-        with contextlib.redirect_stderr(io.StringIO()):
+        with contextlib.redirect_stderr(printed):
             command, unknown = tyro.cli(
                 commands, args=words, prog=prog, description=description, registry=registry, return_unknown_args=True
             )
@@ -68,6 +78,7 @@ def _parsed(commands: Any, words: list[str], prog: str, description: str) -> Any
         if not stopped.code:
             raise
         _check_words(commands, words, prog)
+        _check_values(printed.getvalue(), causes(stopped))
         # says what is wrong
         command = tyro.cli(commands, args=words, prog=prog, description=description, registry=registry)
         unknown = []
@@ -102,20 +113,34 @@ def _unknown_words(commands: Any, words: Sequence[str], unknown: Sequence[str], 
     """The sentence on words that no option takes, with the nearest options of that command."""
     path, known, _ = _asked(commands, words, prog)
     options = [word.partition("=")[0] for word in unknown if word.startswith("--")]
-    near = dict.fromkeys(f"--{match}" for option in options for match in _near(option[2:], [n[2:] for n in known]))
+    close = dict.fromkeys(f"--{match}" for option in options for match in _near(option[2:], [n[2:] for n in known]))
     wrong = "no option of" if options else "not expected by"
-    return f"{', '.join(options or unknown)}: {wrong} `{path}`{_meant(near)} `{path} --help` lists what it takes"
+    hint = meant(close) or ";"
+    return f"{', '.join(options or unknown)}: {wrong} `{path}`{hint} `{path} --help` lists what it takes"
 
 
-def _near(word: str, known: Sequence[str]) -> list[str]:
-    """Up to two of the known names that may be meant by a word."""
-    synonym = SYNONYMS.get(word, "")
-    return [synonym] if synonym in known else difflib.get_close_matches(word, known, n=2)
+def _near(option: str, known: Sequence[str]) -> list[str]:
+    """Up to two of the known options that may be meant, without their dashes."""
+    synonyms = [name for name in SYNONYMS.get(option, ()) if name in known]
+    return synonyms[:1] or near(option, known)
 
 
-def _meant(near: Iterable[str]) -> str:
-    """What ends a sentence on something unknown, before what lists all that is known."""
-    return f"; did you mean {' or '.join(near)}?" if near else ";"
+def _check_values(printed: str, errors: Iterable[BaseException]) -> None:
+    """Looks for an option whose value is none that it takes, or that has none.
+
+    Args:
+        printed: by tyro, which knows the option.
+        errors: that tyro met, one of which knows what is expected.
+
+    Raises:
+        UsageError: there is one.
+    """
+    if missing := MISSING.search(printed):
+        raise UsageError(f"{missing[1]}: expected a value after it, got none")
+    refused = REFUSED.search(printed)
+    for error in errors:
+        if refused and isinstance(error, WrongValue):
+            raise UsageError(f"{f'{refused[1]} ' if refused[1] else ''}{error}") from None
 
 
 def _check_words(commands: Any, words: Sequence[str], prog: str) -> None:
@@ -129,8 +154,8 @@ def _check_words(commands: Any, words: Sequence[str], prog: str) -> None:
     path, known, names = _asked(commands, words, prog)
     after = words[path.count(" ") :]
     if names and after and not after[0].startswith("-"):
-        near = _near(after[0], names)
-        raise UsageError(f"{after[0]}: no command of `{path}`{_meant(near)} `{path} --help` lists them")
+        hint = meant(near(after[0], names)) or ";"
+        raise UsageError(f"{after[0]}: no command of `{path}`{hint} `{path} --help` lists them")
     used = [word.partition("=")[0] for word in words if word.startswith("--")]
     unknown = [option for option in used if option.replace("_", "-") not in known]
     if unknown and path != prog:

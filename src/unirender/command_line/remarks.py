@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from unirender.command_line.input_picture import MANY_CLIPPED
 from unirender.errors import UsageError
 from unirender.system.notices import notice
+from unirender.system.wording import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -46,7 +47,7 @@ def parts_left_out(mask: "np.ndarray | None", side: int) -> dict[str, str]:
     if not beside:
         return {}
     return {
-        "parts": f"{beside} pixels of the mask are taken for stray ones and left out: parts away from the object, "
+        "parts": f"left out as stray: {counted(beside, 'pixel')} of the mask, in parts away from the object, "
         f"together less than {STRAY:.1%} of it; to have their maps, give them a mask of their own"
     }
 
@@ -77,7 +78,8 @@ def frame_remarks(mask: "np.ndarray", side: int, tile: bool) -> dict[str, str]:
 
 
 def with_frame_remarks(picture: "Picture", side: int, tile: bool) -> "Picture":
-    """A picture with those remarks among its others, and a notice of each.
+    """A picture with those remarks among its others, and a notice of each of all: nothing is refused any more that
+    would make them moot.
 
     Args:
         picture: with a mask.
@@ -85,10 +87,10 @@ def with_frame_remarks(picture: "Picture", side: int, tile: bool) -> "Picture":
         tile: likewise.
     """
     assert picture.mask is not None, "what is read for a command has one"
-    found = frame_remarks(picture.mask, side, tile)
-    for remark in found.values():
+    remarks = {**picture.remarks, **frame_remarks(picture.mask, side, tile)}
+    for remark in remarks.values():
         notice(remark)
-    return dataclasses.replace(picture, remarks={**picture.remarks, **found})
+    return dataclasses.replace(picture, remarks=remarks)
 
 
 def overflow(pipeline: "UniRenderPipeline", intrinsics: "Intrinsics") -> dict[str, Any]:

@@ -16,6 +16,7 @@ from unirender.models.config import GONE
 from unirender.models.diffusers_folder import one_line
 from unirender.shipped import checkpoint_folder, shipped_names
 from unirender.system.system_errors import out_of_memory
+from unirender.system.wording import meant, near
 
 INDEX_FILE = "model_index.json"
 PLACE = "_name_or_path"  # in the configuration of what diffusers has read
@@ -43,6 +44,7 @@ def find_pipeline(checkpoint: str | Path | None) -> Path:
         raise UnirenderError(
             f"{path}: no pipeline folder ({INDEX_FILE} is missing), expected one written by `unirender train`, "
             f"or one of the names {', '.join(shipped_names())}; of a hub, download the folder first"
+            f"{meant(near(str(path), shipped_names()))}"
         )
     return path
 

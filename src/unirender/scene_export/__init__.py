@@ -10,6 +10,7 @@
 | `normal.png` | tangent-space normals (n + 1) / 2, green up |
 | `scene.xml` | the same card for Mitsuba 3, with `card.ply`, `roughness.png`, `metallic.png`, `opacity.png` |
 | `environment.exr` | the light on Mitsuba's lat-long grid, in the scene's axes: no rotation; finer for a bright pole |
+| `environment.pfm` | the same bits, for `scene.xml`: with one thread Mitsuba hangs over an EXR |
 | `latlong.exr` | the same light as most programs read a map: rows are areas between the poles |
 | `meta.json` | camera, size, distance and where the maps come from |
 

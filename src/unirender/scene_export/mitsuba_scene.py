@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.exr import image_channels, write_environment, write_exr
-from unirender.light.environment import area_pixels, drawable
+from unirender.light.environment import area_pixels, drawable, pfm_bytes
 from unirender.scene_export.card import Card
 from unirender.visualization import write_png
 
@@ -26,7 +26,9 @@ def write_mitsuba(card: Card, folder: Path) -> None:
     for name, values in (("roughness", card.roughness), ("metallic", card.metallic), ("opacity", card.opacity)):
         write_png(folder / f"{name}.png", values)
     (folder / "card.ply").write_bytes(ply_bytes(card))
-    write_environment(folder / "environment.exr", drawable(card.environment))
+    light = drawable(card.environment)
+    write_environment(folder / "environment.exr", light)
+    (folder / "environment.pfm").write_bytes(pfm_bytes(light))
     finer = max(1, min(4, LATLONG_ROWS // card.environment.shape[0]))
     write_exr(folder / "latlong.exr", image_channels(area_pixels(card.environment, finer)), half=False)
     (folder / "scene.xml").write_text(scene_xml(card), encoding="utf-8")
@@ -107,7 +109,7 @@ _SCENE = """<scene version="3.0.0">
     </film>
     <sampler type="multijitter"><integer name="sample_count" value="64"/></sampler>
   </sensor>
-  <emitter type="envmap"><string name="filename" value="environment.exr"/></emitter>
+  <emitter type="envmap"><string name="filename" value="environment.pfm"/></emitter>
   <shape type="ply">
     <string name="filename" value="card.ply"/>
     <bsdf type="mask">

@@ -13,6 +13,7 @@ from unirender.command_line.options import Device, DType
 from unirender.errors import UnirenderError, UsageError
 from unirender.models.config import ENVIRONMENT_SIZE
 from unirender.system.paths import cache_dir
+from unirender.system.wording import one_of
 from unirender.system.writing import check_out
 from unirender.training.config import TrainConfig
 from unirender.training.config_check import check_config
@@ -175,7 +176,7 @@ class Train:
         """
         config = self.check()
         if self.keep_best is not None and self.keep_best not in (names := score_names()):
-            raise UsageError(f"--keep-best {self.keep_best}: no such score, expected one of: {', '.join(names)}")
+            raise UsageError(f"--keep-best {self.keep_best}: no such score, {one_of(self.keep_best, names)}")
         if not self.data.is_dir():
             raise UnirenderError(
                 f"{self.data}: no such data folder, expected one written by `unirender dataset`; pass --data"

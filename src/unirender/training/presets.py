@@ -8,6 +8,7 @@ import dataclasses
 
 from unirender.errors import UnirenderError
 from unirender.models.config import ModelConfig
+from unirender.system.wording import one_of
 from unirender.training.config import Augmentation, LossConfig, OptimizerConfig, TrainConfig
 
 _TINY = TrainConfig(
@@ -132,5 +133,5 @@ def get_preset(name: str) -> TrainConfig:
         UnirenderError: no such row.
     """
     if name not in PRESETS:
-        raise UnirenderError(f"preset: got {name!r}, expected one of: {', '.join(PRESETS)}")
+        raise UnirenderError(f"preset: got {name!r}, {one_of(name, PRESETS)}")
     return PRESETS[name]

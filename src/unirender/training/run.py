@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from unirender.errors import UsageError
 from unirender.system.notices import notice
+from unirender.system.wording import counted
 from unirender.training.command import Alone, Train
 from unirender.training.config import RunConfig, TrainConfig
 from unirender.training.presets import PRESETS
@@ -130,7 +131,8 @@ def _tell_data(folder: Path, data: "GroupDataset", say: Callable[[str], None]) -
     from unirender.training.data.closed_form_check import doubt
     from unirender.training.data.groups import split_of, unread_shards
 
-    say(f"{folder}: {data.num_pairs} pictures, {len(data.keys)} groups, {len(data.shards)} shards")
+    groups, shards = counted(len(data.keys), "group"), counted(len(data.shards), "shard")
+    say(f"{folder}: {counted(data.num_pairs, 'picture')}, {groups}, {shards}")
     if unread := unread_shards(folder):
         notice(unread)
     if doubtful := doubt(data):

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from unirender_reference.optimize.show.live import clock, live_report
 from unirender_reference.optimize.show.plots import loss_curve
-from unirender_reference.optimize.show.report import Report, refinement_note
+from unirender_reference.optimize.show.report import Report, refinement_note, views_note
 from unirender_reference.optimize.views import Step
 
 FIRST = Report(Step("transport", 1, 2.4, {"cost": 12.5}), 1, 2, None, None)
@@ -90,3 +90,11 @@ def test_a_refinement_that_gained_nothing_is_named():
     rows = [{"stage": "transport", "steps": 9}, {"stage": "refine", "steps": 30, "kept_step": 0}]
     assert refinement_note(rows) == "refine: no gain on the held-out views, the start was kept"
     assert refinement_note([rows[0], {**rows[1], "kept_step": 20}]) is None
+
+
+def test_held_out_views_that_are_explained_much_worse_are_told():
+    note = views_note({"seen_psnr_db": 40.5, "held_out_psnr_db": 19.5})
+    assert note is not None
+    assert note.startswith("held-out views are 21.0 dB worse: what was found suits the pictures that it was fitted to")
+    assert views_note({"seen_psnr_db": 36.0, "held_out_psnr_db": 31.0}) is None
+    assert views_note({"seen_psnr_db": 36.0}) is None

@@ -13,7 +13,7 @@ import numpy as np
 
 from unirender.camera import Camera
 from unirender.exr import image_channels, write_environment, write_exr
-from unirender.light.environment import area_pixels, drawable
+from unirender.light.environment import area_pixels, drawable, pfm_bytes
 from unirender_reference.optimize.files.glb import glb_bytes, png_bytes, texture_pixels
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.shapes import MeshObject, Sphere
@@ -56,14 +56,14 @@ def _write_mitsuba(solution: Solution, folder: Path) -> None:
     pictures |= {"normal": pixels["normal"]} if "normal" in pixels else {}
     for name, values in pictures.items():
         (folder / f"{name}.png").write_bytes(png_bytes(np.ascontiguousarray(values)))
-    (folder / "mesh.ply").write_bytes(ply_bytes(obj))
-    write_environment(folder / ENVIRONMENT_FILE, drawable(solution.environment))
+    (folder / "mesh.ply").write_bytes(_ply_bytes(obj))
+    (folder / "environment.pfm").write_bytes(pfm_bytes(drawable(solution.environment)))
     (folder / "scene.xml").write_text(_SCENE.format(**_scene_values(camera, "normal" in pictures)), encoding="utf-8")
 
 
-def ply_bytes(obj: MeshObject) -> bytes:
+def _ply_bytes(obj: MeshObject) -> bytes:
     """Binary PLY with normals and texture coordinates, as Mitsuba's `ply` plugin reads it."""
-    assert obj.uv is not None
+    assert obj.uv is not None  # texture_pixels has looked
     names = [*(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz", "s", "t"))]
     header = [
         "ply",
@@ -111,7 +111,7 @@ _SCENE = """<scene version="3.0.0">
     </film>
     <sampler type="multijitter"><integer name="sample_count" value="64"/></sampler>
   </sensor>
-  <emitter type="envmap"><string name="filename" value="environment.exr"/></emitter>
+  <emitter type="envmap"><string name="filename" value="environment.pfm"/></emitter>
   <shape type="ply">
     <string name="filename" value="mesh.ply"/>
     {open}<bsdf type="twosided"><bsdf type="principled">{textures}</bsdf></bsdf>{close}

@@ -26,6 +26,8 @@ class Report:
     remaining: float | None
 
 
+FAR = 6.0  # dB by which held-out views are explained worse than others, from which it is said: errors twice as large
+
 OnReport = Callable[[Report], None]  # whoever shows it
 
 
@@ -37,3 +39,19 @@ def refinement_note(stages: Sequence[Mapping[str, Any]]) -> str | None:
     """
     idle = [row["stage"] for row in stages if row.get("kept_step") == 0]
     return f"{', '.join(idle)}: no gain on the held-out views, the start was kept" if idle else None
+
+
+def views_note(figures: Mapping[str, float]) -> str | None:
+    """A sentence where held-out views are explained much worse than those that were fitted; None: they are not.
+
+    Args:
+        figures: of `solution.json`.
+    """
+    gap = figures["seen_psnr_db"] - figures.get("held_out_psnr_db", figures["seen_psnr_db"])
+    if gap < FAR:
+        return None
+    return (
+        f"held-out views are {gap:.1f} dB worse: what was found suits the pictures that it was fitted to more than the "
+        "object; judge it by the held-out figure, and expect no better of other views and lights; pictures from more "
+        "sides may help"
+    )

@@ -20,6 +20,7 @@ import tyro
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.system.notices import notice
+from unirender.system.wording import counted
 
 if TYPE_CHECKING:
     import torch
@@ -57,7 +58,7 @@ class Average:
         """
         count = len(self.checkpoints)
         if count < 2:
-            raise UsageError(f"average: got {count} checkpoints, expected two or more")
+            raise UsageError(f"average: got {counted(count, 'checkpoint')}, expected two or more")
         shares = self.shares or (1.0,) * count
         if len(shares) != count:
             raise UsageError(f"--shares: got {len(shares)}, expected {count}, one for each checkpoint")

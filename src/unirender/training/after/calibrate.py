@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from unirender.command_line.option_checks import at_least
 from unirender.errors import UnirenderError
 from unirender.system.notices import notice
+from unirender.system.wording import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -104,7 +105,7 @@ def calibrate(options: Calibrate) -> "dict[str, Line]":
     if alike:
         print(f"{len(alike)} pairs of groups look alike, such as {' and '.join(alike[0])}: each is of one object")
     if (count := len(set(numbers))) < LEAST_OBJECTS:
-        raise UnirenderError(f"{options.data}: got {count} objects, expected {LEAST_OBJECTS} or more")
+        raise UnirenderError(f"{options.data}: got {counted(count, 'object')}, expected {LEAST_OBJECTS} or more")
     with contextlib.suppress(_NothingKept), new_folder(options.out) as folder:
         groups, found, truth = readings(pipeline, data, options.pictures, options.seed, _tell)
         lines = {name: fit(numbers[groups], found[:, column], truth[:, column]) for column, name in enumerate(NAMES)}
@@ -136,7 +137,7 @@ def _trained_on(data: "GroupDataset", history: Sequence[Mapping[str, Any]]) -> s
         return "this folder"
     hashes = {part for facts in known for part in facts.get("shard_hashes", "").split()}
     seen = [shard.name for shard in data.shards if shard.sha256[:HASH_DIGITS] in hashes]
-    return f"{len(seen)} of its {len(data.shards)} shards, such as {seen[0]}" if seen else None
+    return f"{len(seen)} of its {counted(len(data.shards), 'shard')}, such as {seen[0]}" if seen else None
 
 
 def readings(
@@ -221,4 +222,4 @@ def write_calibrated(
 
 def _tell(done: int, total: int) -> None:
     if done % 50 == 0 or done == total:
-        print(f"decomposed pictures of {done} of {total} groups", flush=True)
+        print(f"decomposed pictures of {done} of {counted(total, 'group')}", flush=True)

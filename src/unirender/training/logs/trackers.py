@@ -19,6 +19,7 @@ from accelerate.tracking import LOGGER_TYPE_TO_CLASS, GeneralTracker, get_availa
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.system.notices import notice
+from unirender.system.wording import one_of
 from unirender.training.config import TrainConfig
 from unirender.training.logs.live import Report
 
@@ -44,8 +45,8 @@ def check_trackers(names: Sequence[str]) -> None:
         if name not in usable:
             if name in LOGGER_TYPE_TO_CLASS:  # all of them have the name of their package
                 raise UsageError(f"--track {name}: not installed here; pip install {name}")
-            expected = ", ".join(sorted(LOGGER_TYPE_TO_CLASS))
-            raise UsageError(f"--track {name}: no tracker that accelerate knows, expected one of {expected}")
+            expected = one_of(name, sorted(LOGGER_TYPE_TO_CLASS))
+            raise UsageError(f"--track {name}: no tracker that accelerate knows, {expected}")
 
 
 def make_trackers(names: Sequence[str], run_folder: Path) -> tuple[GeneralTracker, ...]:
