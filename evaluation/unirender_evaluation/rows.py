@@ -37,7 +37,7 @@ SAMPLE_STEPS, SAMPLE_COUNT = 20, 5
 LOOKS = 6
 FLAT_ALBEDO = "albedo made even between its edges"
 MEAN_OF_LOOKS = "mean of looks at the picture, mirrored and with exchanged channels"
-KEY_LETTERS = "a letter from a to z or a digit: its key is made of them"
+KEY_LETTERS = "a letter from a to z or a digit, of which its key is made, and nothing that does not print"
 
 
 @dataclass(frozen=True)
@@ -115,18 +115,22 @@ def slug(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
+def _is_label(name: str) -> bool:
+    return bool(slug(name)) and name.isprintable()  # others move the cursor, or turn the writing
+
+
 def make_row(method: Any, kind: MethodKind, label: str | None = None, **options: Any) -> Row:
     """A row of a method; `options` are fields of :class:`Row` or of :class:`MethodInfo`.
 
     Raises:
-        UnirenderError: the method's name has nothing for a key, its config is no JSON object, or one of them is a
-            property that fails.
+        UnirenderError: the method's name has nothing for a key or does not print, its config is no JSON object, or one
+            of them is a property that fails.
     """
     fields = {
         name: options.pop(name) for name in ("protocols", "scenes", "pictures", "uses", "told") if name in options
     }
     name, config = (_attribute(method, attribute) for attribute in ("name", "config"))
-    if not isinstance(name, str) or not slug(name):
+    if not isinstance(name, str) or not _is_label(name):
         raise UnirenderError(f"{method!r}: got the name {name!r}, expected a string with {KEY_LETTERS}")
     try:
         config = json.loads(json.dumps(dict(config), allow_nan=False))
@@ -222,12 +226,12 @@ def prediction_rows(folders: Mapping[str, Path]) -> list[Row]:
     """One row per `--predictions name=folder`.
 
     Raises:
-        UsageError: a name has nothing for a key.
+        UsageError: a name has nothing for a key, or does not print.
         UnirenderError: a folder is not one of predictions.
     """
     rows = []
     for name, folder in folders.items():
-        if not slug(name):
+        if not _is_label(name):
             raise UsageError(f"--predictions {name}={folder}: got the name {name!r}, expected {KEY_LETTERS}")
         predictions = PredictionFolder(Path(folder))
         info = MethodInfo(

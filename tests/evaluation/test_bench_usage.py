@@ -109,6 +109,7 @@ def test_the_device_of_our_rows_is_resolved_before_anything_runs() -> None:
     ("names", "expected"),
     [
         (("我们",), "got the name '我们', expected a letter from a to z or a digit"),
+        (("mine\x1b[2J",), "got the name 'mine\\x1b[2J', expected a letter from a to z or a digit"),
         (("Noise ceiling",), "rows: noise-ceiling occur twice or are taken"),
         (("Reference (other seed)",), "rows: reference-other-seed occur twice or are taken"),
         (("true maps",), "rows: true-maps occur twice or are taken"),

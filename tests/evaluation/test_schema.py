@@ -59,6 +59,7 @@ BROKEN = {
     "item": (changed("run", "seeds", to=[0, "1"]), "run.seeds[1]: got '1', expected an integer"),
     "backbone": (changed("run", "lpips", to=["squeeze"]), "run.lpips[0]: got 'squeeze', expected one of vgg, alex"),
     "kind": (changed("run", "methods", 0, "kind", to="best"), "run.methods[0].kind: got 'best', expected one of ours"),
+    "label": (changed("run", "methods", 0, "label", to="a\x1b[2J"), "run.methods[0].label: got 'a\\x1b[2J', expected"),
     "steps": (changed("run", "methods", 0, "steps", to=0), "run.methods[0].steps: got 0"),
     "empty": (changed("records", 2, "sample", to=""), "records[2].sample: got '', expected a string (the suite's name"),
     "values": (changed("records", 0, "values", to=[1]), "records[0].values: got [1], expected an object (metric key"),

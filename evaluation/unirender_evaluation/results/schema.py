@@ -22,6 +22,7 @@ FORMAT = "unirender-results"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 INFINITIES = ("inf", "-inf")
 NAME = {"minLength": 1}
+PRINTED = {"pattern": r"^[^\u0000-\u001f\u007f-\u009f\u202a-\u202e\u2066-\u2069]+$"}  # no word to a terminal
 
 # What a field means beyond its type: keywords, and the sentence that an error quotes after "expected".
 FIELDS: Mapping[str, Mapping[str, dict[str, Any]]] = {
@@ -37,7 +38,7 @@ FIELDS: Mapping[str, Mapping[str, dict[str, Any]]] = {
     },
     "MethodInfo": {
         "key": {**NAME, "description": "what records refer to"},
-        "label": {**NAME, "description": "what a table prints"},
+        "label": {**PRINTED, "description": "what a table prints, without control characters"},
         "kind": {"description": "the kind of the row"},
         "published": {"description": "the name of the paper's row that it stands beside, or null"},
         "steps": {"minimum": 1, "description": "denoising steps, at least 1, or null"},
