@@ -30,7 +30,7 @@ from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.light_balls import MATTE_BALL
 from unirender_evaluation.metrics import DEFAULT_VARIANT, PUBLISHED_VARIANT, Variant
 from unirender_evaluation.records import Record
-from unirender_evaluation.results.commands import columns_of
+from unirender_evaluation.results.commands import asked_specs
 from unirender_evaluation.results.data import NAME, PACKED, Results
 from unirender_evaluation.results.file import read_results, write_results
 from unirender_evaluation.results.findings import Question, against_trivial
@@ -172,8 +172,7 @@ def chosen(
     """Those tables that have records, of some rows and metrics alone; `asked`: protocols by the tables' names."""
     run = replace(results.run, methods=tuple(info for info in results.run.methods if info.key in rows))
     records = [record for record in results.records if record.method in rows]
-    specs = {name: spec for name in asked if (spec := columns_of(ALL_TABLES[name], metrics))}
-    tables = build_tables(records, run, specs, [variant])
+    tables = build_tables(records, run, asked_specs(tuple(asked), metrics), [variant])
     return [table for table in tables if (asked[table.name], "main") == (table.protocol_key, table.subset)]
 
 

@@ -41,13 +41,15 @@ def test_rows_keep_their_order_and_the_one_without_a_group_is_always_there() -> 
     assert names("full") == ["full"]
 
 
-@pytest.mark.parametrize("wanted", [("colour",), ("log", "colour"), ("Losses", "colour"), ("",)])
+@pytest.mark.parametrize("wanted", [("colour",), ("log", "colour"), ("brown", "colour"), ("",)])
 def test_a_name_of_neither_is_refused_with_those_that_can_be_used(wanted: tuple[str, ...]) -> None:
     unknown = " ".join(name for name in wanted if name != "log")
     expected = f"--rows {unknown}: expected some of full, log, grey, srgb, or the groups losses, start"
     with pytest.raises(UsageError) as refused:
         chosen(ROWS, wanted, "--rows")
     assert str(refused.value) == expected
+    with pytest.raises(UsageError, match=r"start; did you mean losses\?$"):
+        chosen(ROWS, ("Losses",), "--rows")
 
 
 @pytest.mark.parametrize(
