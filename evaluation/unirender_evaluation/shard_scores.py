@@ -14,7 +14,7 @@ import numpy as np
 from unirender.color import image_srgb, unpremultiply
 from unirender.intrinsics import Intrinsics
 from unirender.training.data.dataset import GroupDataset
-from unirender.training.data.groups import Pair
+from unirender.training.data.packing import Pair
 from unirender.training.data.same_objects import object_of
 from unirender_evaluation.methods.composite import ShadowedSplitSum
 from unirender_evaluation.metrics import metric_key

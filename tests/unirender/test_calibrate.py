@@ -26,7 +26,7 @@ from unirender.training.after.calibration_line import Line, fit
 from unirender.training.augmentations.augment import Draw
 from unirender.training.config import RunConfig
 from unirender.training.data.dataset import GroupDataset
-from unirender.training.data.groups import Pair
+from unirender.training.data.packing import Pair
 from unirender.training.data.same_objects import object_of, objects_of
 from unirender.training.loop.facts import dataset_facts
 from unirender.training.loop.trainer import Trainer

@@ -30,7 +30,8 @@ from unirender.training.augmentations.augment import (
 from unirender.training.augmentations.environments import turned_environments
 from unirender.training.config import Augmentation
 from unirender.training.data.dataset import BATCH_MAPS, GroupDataset
-from unirender.training.data.groups import Pair, list_shards, read_groups, split_of, unread_shards
+from unirender.training.data.groups import list_shards, read_groups, split_of, unread_shards
+from unirender.training.data.packing import Pair
 from unirender.training.data.reader import BatchReader
 from unirender.training.data.source import ShardSource
 
