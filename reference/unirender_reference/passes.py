@@ -298,7 +298,7 @@ def derive_seed(*parts: int | str) -> int:
     for part in parts:
         if not isinstance(part, str | Integral):
             raise UnirenderError(f"seed: got {part!r:.60}, expected a whole number")
-    plain = tuple(part if isinstance(part, str) else int(part) for part in parts)  # numpy's numbers print otherwise
+    plain = tuple(str(part) if isinstance(part, str) else int(part) for part in parts)  # numpy's print otherwise
     return int.from_bytes(hashlib.sha256(repr(plain).encode()).digest()[:4], "little")
 
 

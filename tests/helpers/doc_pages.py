@@ -146,7 +146,10 @@ def other_method() -> Names:
         for name in (f"{picture}/0000.basecolor.jpg", f"rough/{picture}.png", f"depth/{picture}.png"):
             target = Path("written") / name
             target.parent.mkdir(parents=True, exist_ok=True)
-            large.convert("RGB" if "base" in name else "L").save(target, quality=100)
+            kept = large.convert("RGB" if "base" in name else "L")
+            if "rough" in name:
+                kept = Image.fromarray(np.asarray(kept).astype(np.uint16) * 257)  # 16 bits
+            kept.save(target, quality=100)
     sys.argv[:] = ["gather.py", "inputs", "written", "predictions"]
     return {}
 
@@ -164,6 +167,9 @@ def check_gathered(names: Names) -> None:
         true, *others = (np.asarray(each, np.float64) for each in (shown, found, plain))
         error, plain_error = (np.sum(true[..., 3:] * (each - true[..., :3]) ** 2) for each in others)
         assert error < 0.6 * plain_error
+        rough, grey = (np.asarray(Image.open(each).convert("L")) for each in (path.with_name("roughness.png"), path))
+        inside = true[..., 3] == 255
+        assert abs(np.mean(rough[inside], dtype=float) - np.mean(grey[inside], dtype=float)) < 8, "16 bits as 8"
 
 
 def shaded() -> Names:

@@ -38,18 +38,26 @@ MISTAKES: Mapping[str, Mistake] = {  # by the name of the metric that has the ga
     "if_decoded": Mistake("taken for display values (encoded? expected linear)", TONE),
     "if_encoded": Mistake("encoded once more (decoded twice?)", TONE),
     "if_bgr": Mistake("with red and blue exchanged (BGR?)", PLACE),
+    "if_y_down": Mistake('with normal_axes = ["+x", "-y", "+z"] (y down?)', PLACE),
+    "if_opencv": Mistake('with normal_axes = ["+x", "-y", "-z"] (OpenCV?)', PLACE),
+    "if_x_left": Mistake('with normal_axes = ["-x", "+y", "+z"] (x to the left?)', PLACE),
     "if_other_signs": Mistake("with other signs (+x is right, +y up, +z to the viewer)", PLACE),
     "if_other_axes": Mistake("with x, y and z exchanged (z up?)", PLACE),
     "if_edges": Mistake("with other edges (mixed with black or white, or straight for premultiplied?)", PLACE),
     "if_mirrored": Mistake("mirrored left to right", PLACE),
     "if_upside_down": Mistake("upside down (rows from the bottom?)", PLACE),
     "if_shifted": Mistake("moved by one pixel (cropped or resampled by other rules?)", PLACE),
-    "if_turned": Mistake("turned by quarter turns (its middle is behind the camera)", PLACE),
-    "if_mirrored_and_turned": Mistake("mirrored and turned by quarter turns (its middle is behind the camera)", PLACE),
+    "if_turned": Mistake("turned by half (its middle is behind the camera)", PLACE),
+    "if_turned_right": Mistake("rolled by a quarter of its width", PLACE),
+    "if_turned_left": Mistake("rolled by three quarters of its width", PLACE),
+    "if_mirrored_and_turned": Mistake("mirrored and turned by half (its middle is behind the camera)", PLACE),
+    "if_mirrored_and_turned_right": Mistake("mirrored, then rolled by a quarter of its width", PLACE),
+    "if_mirrored_and_turned_left": Mistake("mirrored, then rolled by three quarters of its width", PLACE),
     "if_inverted": Mistake("taken for 1 minus it (smoothness?)", TONE),
     "if_root": Mistake("as its square root (the GGX alpha, or too low throughout?)", TONE),
     "if_swapped": Mistake("exchanged with metallic", TONE),
 }
+SIGNS = {(1, -1, 1): "if_y_down", (1, -1, -1): "if_opencv", (-1, 1, 1): "if_x_left"}  # of x, y and z
 GAINS: Mapping[str, Metric] = {
     name: Metric(
         name, name.replace("_", " "), "dB", LOWER, -MOST_DB, (), 1, f"gain of a stranger's answer {mistake.said}"
@@ -59,8 +67,9 @@ GAINS: Mapping[str, Metric] = {
 
 
 def colour_gains(found: Map, true: Map, mask: Mask) -> dict[str, float]:
-    """Mistake -> gain in masked error of display values. What is encoded once more gains beyond what another brightness
-    does: no picture fixes that of an albedo or a light, and all that is dark is nearer to the truth when it is encoded.
+    """Mistake -> gain in masked error of display values. What is encoded once more or decoded gains beyond what another
+    brightness does: no picture fixes that of an albedo or a light, and all that is dark is nearer to the truth when it
+    is encoded, all that is bright when it is decoded.
 
     Args:
         found: linear, not premultiplied.
@@ -86,7 +95,8 @@ def colour_gains(found: Map, true: Map, mask: Mask) -> dict[str, float]:
     as_it_is = error(shown)
     gains = {name: _gain(as_it_is, map(error, answers)) for name, answers in undone.items()}
     as_bright = srgb_encode(np.clip(metrics.align_scale(found, true, mask, "aligned"), 0, 1))
-    return gains | {"if_encoded": _gain(min(as_it_is, error(as_bright)), map(error, undone["if_encoded"]))}
+    level = min(as_it_is, error(as_bright))
+    return gains | {name: _gain(level, map(error, undone[name])) for name in ("if_decoded", "if_encoded")}
 
 
 def normal_gains(found: Map, true: Map, mask: Mask) -> dict[str, float]:
@@ -104,11 +114,12 @@ def normal_gains(found: Map, true: Map, mask: Mask) -> dict[str, float]:
     gains = {name: _gain(as_it_is, map(error, answers)) for name, answers in undone.items()}
     p, t = (x / np.maximum(np.linalg.norm(x.astype(np.float64), axis=-1, keepdims=True), EXACT) for x in (found, true))
     shares = np.einsum("hwi,hwj->ij", p * mask, t) / mask.sum(dtype=np.float64)  # of channel i in axis j
-    axes: dict[str, list[float]] = {"if_other_signs": [], "if_other_axes": []}
+    axes: dict[str, list[float]] = {}
     as_they_are, *others = product(permutations(range(3)), product((1, -1), repeat=3))
     for order, signs in others:
         cosine = float(np.sum(np.array(signs) * shares[list(order), range(3)]))
-        axes["if_other_signs" if order == as_they_are[0] else "if_other_axes"].append(1 - cosine)
+        name = SIGNS.get(signs, "if_other_signs") if order == as_they_are[0] else "if_other_axes"
+        axes.setdefault(name, []).append(1 - cosine)
     return gains | {name: _gain(as_it_is, errors) for name, errors in axes.items()}
 
 
@@ -131,12 +142,11 @@ def light_gains(found: Light, true: Float[np.ndarray, "h2 w2 3"]) -> dict[str, f
         "if_mirrored": p[:, ::-1],
         "if_upside_down": p[::-1],
     }
-    as_it_is = error(p)
-    gains = {name: _gain(as_it_is, [error(answer)]) for name, answer in undone.items()}
-    quarters = [SHAPE[1] * quarter // 4 for quarter in (1, 2, 3)]
     for name, side in (("if_turned", p), ("if_mirrored_and_turned", p[:, ::-1])):
-        gains[name] = _gain(as_it_is, [error(np.roll(side, by, 1)) for by in quarters])
-    return gains
+        for turn, quarters in (("_right", 1), ("", 2), ("_left", 3)):
+            undone[name + turn] = np.roll(side, SHAPE[1] * quarters // 4, 1)
+    as_it_is = error(p)
+    return {name: _gain(as_it_is, [error(answer)]) for name, answer in undone.items()}
 
 
 def roughness_gains(found: Intrinsics, true: Intrinsics, mask: Mask) -> dict[str, float]:

@@ -52,6 +52,8 @@ OURS, SAMPLED = "ours-mean", "ours-sample"
 PAPER_ROWS = (
     OURS,
     "ours-mean-anchored",
+    "ours-mean-6-looks",
+    "composite-of-ours-mean-anchored",
     "nvdiffrec-mitsuba",
     "unedited-input",
     "input-as-albedo",

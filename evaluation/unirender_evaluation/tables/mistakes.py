@@ -65,8 +65,8 @@ def _counts(of_names: Mapping[str, Sequence[Sequence[float]]]) -> str:
 
 
 def _likely(quantity: str, records: Sequence[Record]) -> dict[str, list[float]]:
-    """Mistake -> its gains that say something, of those that are probably made: by a large mean gain, or by a smaller
-    one that other objects would show, too."""
+    """Mistake -> its gains that say something, of those that are probably made: by a large mean gain, or, but for
+    roughness, whose bias alone may gain, by a smaller one that other objects would show, too."""
     found = {}
     for name, metric in GAINS.items():
         key = metric_key(quantity, metric)
@@ -75,6 +75,6 @@ def _likely(quantity: str, records: Sequence[Record]) -> dict[str, list[float]]:
         if len(set(objects)) < FEWEST or sum(g > 0 for g in gains) <= MOST * len(gains):
             continue
         gain = mean_estimate(gains, objects)
-        if gain.mean > MISTAKES[name].least or gain.low > PLACE:
+        if gain.mean > MISTAKES[name].least or (gain.low > PLACE and quantity != "roughness"):
             found[name] = gains
     return found

@@ -91,16 +91,18 @@ def several(asked: PrimitiveTypeInfo) -> Spec:
 
 @registry.primitive_rule
 def optional(asked: PrimitiveTypeInfo) -> Spec:
-    """A value or None. The word None is taken, since an option may have another default, but not offered."""
+    """A value or None. The word None is taken, since an option may have another default, but not offered; among the
+    words of a choice it is none."""
     kinds = [kind for kind in get_args(asked.type) if kind is not type(None)]
     if len(kinds) != 1 or type(None) not in get_args(asked.type):
         return None
     spec = ConstructorRegistry.get_primitive_spec(PrimitiveTypeInfo.make(kinds[0], asked.markers))
     if isinstance(spec, UnsupportedTypeAnnotationError):
         return spec
+    takes_none = get_origin(kinds[0]) is not Literal
     return dataclasses.replace(
         spec,
-        instance_from_str=lambda words: None if words == ["None"] else spec.instance_from_str(words),
+        instance_from_str=lambda words: None if takes_none and words == ["None"] else spec.instance_from_str(words),
         is_instance=lambda value: value is None or spec.is_instance(value),
         str_from_instance=lambda value: ["None"] if value is None else spec.str_from_instance(value),
     )

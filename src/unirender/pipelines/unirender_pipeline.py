@@ -409,7 +409,7 @@ class UniRenderPipeline(DualStreamPipeline):
     def _picture(self, image: Any, mask: Any) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 1"]]:
         picture, cover = as_picture(image, mask)
         if mask is None and cover.min() == 1:
-            self._report_once("mask", "not given, nor an alpha channel: the whole frame is taken as the object")
+            self._report_once("mask", "not given, and no pixel is transparent: the whole frame is taken as the object")
         return picture, cover
 
     def _decomposition(

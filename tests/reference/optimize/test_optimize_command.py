@@ -500,7 +500,10 @@ def test_one_picture(solution: Solution, tmp_path: Path, capsys: pytest.CaptureF
     assert (tmp_path / "out/history.jsonl").read_text().count("\n") >= 2
     said = capsys.readouterr().out
     assert f"rendered again: {meta['psnr_db']:.2f} dB" in said
-    assert said.endswith("assumed, since one picture does not tell it: metallic (0.5), the mean of albedo (0.25)\n")
+    assert said.endswith(
+        "assumed, since one picture does not tell it: metallic (0.5), the mean of albedo (0.25); colours of albedo and "
+        "light may be exchanged\n"
+    )
     assert meta["config"]["trust"] == dataclasses.asdict(COLD_NORMALS)
     again = channels_rgb(read_exr(tmp_path / "out/image.exr")[0])
     shown, given = image_srgb(unpremultiply(again, view.mask)), view.image

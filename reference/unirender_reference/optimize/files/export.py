@@ -56,12 +56,12 @@ def _write_mitsuba(solution: Solution, folder: Path) -> None:
     pictures |= {"normal": pixels["normal"]} if "normal" in pixels else {}
     for name, values in pictures.items():
         (folder / f"{name}.png").write_bytes(png_bytes(np.ascontiguousarray(values)))
-    (folder / "mesh.ply").write_bytes(_ply_bytes(obj))
+    (folder / "mesh.ply").write_bytes(ply_bytes(obj))
     (folder / "environment.pfm").write_bytes(pfm_bytes(drawable(solution.environment)))
     (folder / "scene.xml").write_text(_SCENE.format(**_scene_values(camera, "normal" in pictures)), encoding="utf-8")
 
 
-def _ply_bytes(obj: MeshObject) -> bytes:
+def ply_bytes(obj: MeshObject) -> bytes:
     """Binary PLY with normals and texture coordinates, as Mitsuba's `ply` plugin reads it."""
     assert obj.uv is not None  # texture_pixels has looked
     names = [*(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz", "s", "t"))]

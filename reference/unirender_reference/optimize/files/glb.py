@@ -44,7 +44,7 @@ def glb_bytes(obj: MeshObject, place: Sphere | None = None) -> bytes:
     mesh = trimesh.Trimesh(obj.vertices, obj.faces, vertex_normals=obj.normals, visual=visual, process=False)
     scene = trimesh.Scene()
     transform = None if place is None else scale_and_translate(place.radius, place.center)
-    scene.add_geometry(mesh, node_name=obj.name, geom_name=obj.name, transform=transform)
+    scene.add_geometry(mesh, node_name="object", geom_name=obj.name, transform=transform)  # "world" is trimesh's own
     return export_glb(scene, include_normals=True, unitize_normals=False)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from unirender_reference.arrays import components
+from unirender_reference.arrays import aligned, components
 from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.solution import Solution
@@ -78,7 +78,7 @@ def _round(scene: Any, ray: Any, kept: np.ndarray, lanes: int, seed: int) -> tup
     import drjit as dr
 
     count = len(kept) * lanes
-    index = dr.gather(mi.UInt32, mi.UInt32(kept.astype(np.uint32)), dr.arange(mi.UInt32, count) // lanes)
+    index = dr.gather(mi.UInt32, mi.UInt32(aligned(kept.astype(np.uint32))), dr.arange(mi.UInt32, count) // lanes)
     own = dr.gather(mi.Ray3f, ray, index)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(dr.opaque(mi.UInt32, seed), count)

@@ -194,4 +194,5 @@ def kept_note(trust: Trust, warm: bool) -> str:
     if warm:
         return f"as predicted, since one picture does not tell it: {', '.join(kept)}"
     shown = [f"{name} ({COLD[name.rpartition(' ')[2]]:g})" for name in kept]
-    return f"assumed, since one picture does not tell it: {', '.join(shown)}"
+    note = f"assumed, since one picture does not tell it: {', '.join(shown)}"
+    return note if "albedo" in kept else f"{note}; colours of albedo and light may be exchanged"

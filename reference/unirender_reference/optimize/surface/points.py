@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender_reference.arrays import components
+from unirender_reference.arrays import aligned, components
 from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.views import View
 from unirender_reference.passes import derive_seed
@@ -164,7 +164,7 @@ def _trace(
     mi = mitsuba()
     width, covered = mask.shape[1], np.flatnonzero(mask[..., 0] > 0)
     count = len(covered) * samples
-    pixel = dr.gather(mi.UInt32, mi.UInt32(covered.astype(np.uint32)), dr.arange(mi.UInt32, count) // samples)
+    pixel = dr.gather(mi.UInt32, mi.UInt32(aligned(covered.astype(np.uint32))), dr.arange(mi.UInt32, count) // samples)
     sampler = stratified_sampler(samples, count, seed)
     corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
     position = (corner + sampler.next_2d()) / mi.Point2f(size[1], size[0])
