@@ -183,6 +183,7 @@ def test_letters_that_the_output_lacks_are_printed_by_their_number(monkeypatch: 
         (["edit", "x.png", "--output", "y", "--samples=1.5"], "--samples 1.5: expected a whole number"),
         (["figures", "--values", "0", "o.5", "--out", "y"], "--values o.5: expected a number"),
         (["edit", "x.png", "--output", "y", "--sampler", "euler"], "--sampler euler: expected one of ddim, unipc"),
+        (["edit", "x.png", "--output", "y", "--sampler", "None"], "--sampler None: expected one of ddim, unipc"),
         (
             ["optimize", "x", "--out", "y", "--init", "unirendr"],
             "--init unirendr: expected one of none, unirender; did you mean unirender?",

@@ -92,8 +92,10 @@ def test_trimesh_reads_every_texel(solution: Solution, folder: Path):
     np.testing.assert_array_equal(np.asarray(material.metallicRoughnessTexture), pixels["metallic_roughness"])
 
 
-def test_the_object_returns_to_where_its_mesh_stood(solution: Solution, tmp_path: Path):
+@pytest.mark.parametrize("name", ["ball", "world"])  # trimesh's own frame is called world
+def test_the_object_returns_to_where_its_mesh_stood(solution: Solution, tmp_path: Path, name: str):
     place = Sphere(np.array([10.0, -4.0, 0.5]), 2.5)
+    solution = dataclasses.replace(solution, obj=dataclasses.replace(solution.obj, name=name))
     write_solution(solution, tmp_path, place)
     back, found = load_mesh_placed(tmp_path / "mesh.glb")
     points = surface_points(solution.obj)[0] * place.radius + place.center
