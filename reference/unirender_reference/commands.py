@@ -226,8 +226,8 @@ class Dataset:
         for failure in report.failures[:SHOWN_FAILURES]:
             _log.warning("%s: %s", failure.file, failure.reason)
         if report.failures:
-            files = len({failure.file for failure in report.failures})
-            _log.warning("%d files failed; all are listed with reasons in %s", files, self.out / "failures.jsonl")
+            files = counted(len({failure.file for failure in report.failures}), "file")
+            _log.warning("%s failed; all are listed with reasons in %s", files, self.out / "failures.jsonl")
         if again := {failure.file for failure in report.failures if failure.machine}:
             _log.warning(
                 "%d of them lacked time or memory, or their worker died; the same command tries these again",
