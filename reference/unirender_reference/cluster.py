@@ -91,6 +91,9 @@ class ClusterFuture:
         """Forgets the task: it is not started any more; its result is dropped."""
         self._future.cancel()
 
+    def done(self) -> bool:
+        return bool(self._future.done())
+
 
 class ClusterExecutor:
     """Runs functions on a cluster's workers; made by `connect`.

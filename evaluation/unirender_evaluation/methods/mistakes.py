@@ -57,7 +57,11 @@ MISTAKES: Mapping[str, Mistake] = {  # by the name of the metric that has the ga
     "if_root": Mistake("as its square root (the GGX alpha, or too low throughout?)", TONE),
     "if_swapped": Mistake("exchanged with metallic", TONE),
 }
-SIGNS = {(1, -1, 1): "if_y_down", (1, -1, -1): "if_opencv", (-1, 1, 1): "if_x_left"}  # of x, y and z
+SIGNS: Mapping[tuple[int, ...], str] = {
+    (1, -1, 1): "if_y_down",
+    (1, -1, -1): "if_opencv",
+    (-1, 1, 1): "if_x_left",
+}  # of x, y and z
 GAINS: Mapping[str, Metric] = {
     name: Metric(
         name, name.replace("_", " "), "dB", LOWER, -MOST_DB, (), 1, f"gain of a stranger's answer {mistake.said}"

@@ -95,11 +95,11 @@ def run_on_cluster(
     Raises:
         UnirenderError: as `connect`; a worker cannot do it, or several died over a scene.
     """
-    from unirender_reference.cluster import connect
+    from unirender_reference.cluster import ClusterFuture, connect
 
     order = Order.of(run, build, suite)
     with connect(address) as executor:
-        under_way: list[Any] = []
+        under_way: list[ClusterFuture] = []
         waiting = deque(wanted.items())
         while waiting or under_way:
             while waiting and len(under_way) < AHEAD * max(executor.workers, 1):
