@@ -278,9 +278,9 @@ def test_a_light_that_the_memory_does_not_hold_is_refused(
 
 
 def test_what_a_result_has_of_its_start_is_named() -> None:
-    told = "since one picture does not tell it: "
-    assert kept_note(COLD_MESH, warm=False) == f"assumed, {told}metallic (0.5), the mean of albedo (0.25)"
-    assert kept_note(Trust(), warm=False) == f"assumed, {told}the mean of albedo (0.25)"
+    told, colours = "since one picture does not tell it: ", "; colours of albedo and light may be exchanged"
+    assert kept_note(COLD_MESH, warm=False) == f"assumed, {told}metallic (0.5), the mean of albedo (0.25){colours}"
+    assert kept_note(Trust(), warm=False) == f"assumed, {told}the mean of albedo (0.25){colours}"
     assert kept_note(WARM_NORMALS, warm=True) == f"as predicted, {told}metallic, roughness, albedo"
 
 
