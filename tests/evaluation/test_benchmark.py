@@ -398,7 +398,7 @@ def test_what_is_probably_a_mistake_is_noted(suite: Suite, tmp_path: Path) -> No
     assert doubts("guess", [record for record in records if record.sample.endswith("_0")]) == []
     mask, normals = doubts("turned", records)
     assert re.search(r"misses the object on \d+ of \d+ pictures", mask)
-    assert f"with other signs (+x is right, +y up, +z to the viewer): normal ({n} of {n}, +" in normals
+    assert f'with normal_axes = ["+x", "-y", "-z"] (OpenCV?): normal ({n} of {n}, +' in normals
 
 
 class Encoded(Guess):
@@ -430,7 +430,7 @@ def test_other_conventions_that_only_the_score_tells_are_noted(suite: Suite, tmp
     (said,) = doubts("encoded", records)
     n = 4 * len(suite.scenes[0].materials)
     assert f"taken for display values (encoded? expected linear): albedo ({n} of {n}, +20.0 dB)" in said
-    assert f", and with other signs (+x is right, +y up, +z to the viewer): normal ({n} of {n}, +20.0 dB)" in said
+    assert f', and with normal_axes = ["+x", "-y", "+z"] (y down?): normal ({n} of {n}, +20.0 dB)' in said
     assert [note for row in rows[1:] for note in doubts(row.info.key, records[: len(records) // 4])] == []
 
 
