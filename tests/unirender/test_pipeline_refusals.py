@@ -292,7 +292,7 @@ def test_a_frame_without_a_mask_is_told_once(caplog: pytest.LogCaptureFixture) -
     assert "mask" not in caplog.text
     pipeline.edit(image, metallic=1.0)
     pipeline.decompose(image)
-    assert caplog.text.count("mask: not given, nor an alpha channel: the whole frame is taken") == 1
+    assert caplog.text.count("mask: not given, and no pixel is transparent: the whole frame is taken") == 1
 
 
 def test_normals_of_other_axes_are_told(pipeline: UniRenderPipeline, caplog: pytest.LogCaptureFixture) -> None:
