@@ -268,7 +268,7 @@ EXAMPLES = {
     "lights.md": Example(own_lights),
     "materials.md": Example(less={"metallic=0.5)": "metallic=0.5, resolution=16)", "spp=64": "spp=8"}),
     "meshes.md": Example(models, check=check_meshes),
-    "model.md": Example(less={"range(8)": "range(1)", "resolution=128": "resolution=80", "spp=64": "spp=8"}),
+    "model.md": Example(),
     "optimization.md": Example(
         optimizer,
         {
