@@ -123,6 +123,7 @@ NOT_IN_RECORDS = (
     "mix_command",
     "mix_folder",
     "multiview",
+    "option_checks",
     "optimize/*",
     "plan",
     "principled",

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from unirender.errors import UnirenderError, UsageError
+from unirender.errors import UsageError
 from unirender.system.wording import counted
 from unirender_reference.measure.output import check_file, png_bytes, write_file
+from unirender_reference.option_checks import require_least
 
 if TYPE_CHECKING:
     import numpy as np
@@ -44,15 +45,9 @@ class Sheet:
         from unirender_reference.render import render_sample
         from unirender_reference.sheets import DARK, LIGHT, table_sheet
 
-        if self.objects < 0 or self.objects + len(self.mesh) == 0:
-            raise UsageError(f"--objects {self.objects}: expected at least one object or --mesh")
-        if self.resolution < 16 or self.spp < 8 or self.spp % 8 or self.seed < 0:
-            raise UsageError(
-                f"--resolution {self.resolution}, --spp {self.spp}, --seed {self.seed}: expected at least 16 px, a "
-                "multiple of 8 samples, a seed of 0 or more"
-            )
-        if not self.out.absolute().parent.is_dir():
-            raise UnirenderError(f"{self.out}: no such folder, expected one to write the sheet into; make it first")
+        require_least(self, "", {"objects": 0 if self.mesh else 1, "resolution": 16, "spp": 8, "seed": 0})
+        if self.spp % 8:
+            raise UsageError(f"--spp {self.spp}: expected a multiple of 8")
         check_file("--out", self.out)
         if self.out.suffix.lower() != ".png":
             raise UsageError(f"--out {self.out}: expected the name of a PNG file, like {self.out.with_suffix('.png')}")
