@@ -87,7 +87,7 @@ def over_lights(values: Mapping[str, float], records: Iterable[Record], lights: 
     if unnamed := sorted(values.keys() - lights.keys()):
         raise UnirenderError(
             f"interval over objects and lights: the lights of {unnamed[0]!r} and {len(unnamed) - 1} more samples are "
-            "not named; `python -m unirender_evaluation.results.lights SUITE results.json` names them"
+            "not named, and the very suite is not installed, which would tell them; leave it out"
         )
     objects = {record.sample: record.object for record in records}
     return crossed_estimate(

@@ -38,7 +38,7 @@ class Part:
     variables: tuple[str, ...] = ()  # of the environment
 
 
-LIGHT_READER = ("lights/files.py", "lights/light.py")  # of lights in folders of predictions
+LIGHT_READER = tuple(f"lights/{name}.py" for name in ("files", "light", "photograph", "radiance"))  # of predictions
 
 # Not in any record: commands and what makes the suites (which have hashes of their own), and all that is made from
 # the records anew at the end of every run.
@@ -123,6 +123,7 @@ NOT_IN_RECORDS = (
     "mix_command",
     "mix_folder",
     "multiview",
+    "option_checks",
     "optimize/*",
     "plan",
     "principled",

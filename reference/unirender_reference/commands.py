@@ -104,29 +104,9 @@ class Dataset:
                 from unirender_reference.cluster import check_address
 
                 check_address(self.cluster)
-            return DatasetConfig(
-                objects=self.objects,
-                pairs=pairs if self.pairs is None else self.pairs,
-                resolution=self.resolution,
-                vary=vary,
-                out=self.out,
-                seed=self.seed,
-                split=self.split,
-                spp=self.spp,
-                workers=self.workers,
-                meshes=self.meshes,
-                holdout=self.holdout,
-                turn_objects=self.turn_objects,
-                materials=self.materials,
-                noise_floor=self.noise_floor,
-                denoise=self.denoise,
-                lights=self.lights,
-                light_share=self.light_share,
-                light_holdout=self.light_holdout,
-                turn_lights=self.turn_lights,
-                light_height=self.light_height,
-                cluster=self.cluster,
-            )
+            asked = {f.name: getattr(self, f.name) for f in fields(DatasetConfig) if f.name != "lights_digest"}
+            asked |= {"pairs": pairs if self.pairs is None else self.pairs, "vary": vary}
+            return DatasetConfig(**asked)
         except UnirenderError as error:
             raise UsageError(str(error)) from error
 

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from unirender.errors import UsageError
+from unirender_reference.option_checks import require_least
 
 PROGRESS_EVERY = 100
 
@@ -44,9 +45,7 @@ class MixMeshes:
 
         if not self.patterns:
             raise UsageError("mix-meshes: got no folder, expected at least one with meshes")
-        for name, least in (("count", 1), ("seed", 0), ("max_faces", 1)):
-            if getattr(self, name) < least:
-                raise UsageError(f"--{name.replace('_', '-')}: got {getattr(self, name)}, expected at least {least}")
+        require_least(self, "", {"count": 1, "seed": 0, "max_faces": 1})
         if self.max_faces > (most := MAX_FACES // MAX_PARTS):
             raise UsageError(
                 f"--max-faces: got {self.max_faces:,}, expected at most {most:,}: {MAX_PARTS} such meshes are as many "

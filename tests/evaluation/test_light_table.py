@@ -1,5 +1,9 @@
 """The light table: balls under a light, the rows that a found light must beat, and lights from folders."""
 
+import io
+import json
+import tarfile
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +13,13 @@ from tiny_suites import make_suite
 from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
-from unirender.exr import image_channels, write_environment, write_exr
+from unirender.exr import exr_bytes, image_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender.light.environment import environment_directions, resample_environment
 from unirender_evaluation.bounds import TRUE_LIGHT, ceiling_jobs
 from unirender_evaluation.claims import light_claims
 from unirender_evaluation.engine import answer, score
 from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL, ball_mask, ball_normals, ball_values, balls
-from unirender_evaluation.light_statistics import light_means, light_statistics, write_statistics
 from unirender_evaluation.methods.light import MeanLight, UniformLight
 from unirender_evaluation.methods.mitsuba import mitsuba_jobs
 from unirender_evaluation.metrics import metric_key
@@ -30,6 +33,7 @@ from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables.build import build_table
 from unirender_evaluation.task import Task
 from unirender_evaluation.tasks import tasks
+from unirender_evaluation.training_statistics import light_statistics, measure
 from unirender_evaluation.verdict import findings
 from unirender_reference.lights.light import area_resampled
 
@@ -152,33 +156,31 @@ def test_rows_that_a_light_must_beat(suite: Suite) -> None:
     assert "training" in light_statistics()["provenance"]
 
 
-def test_the_mean_light_is_measured(tmp_path: Path) -> None:
-    import io
-    import json
-    import tarfile
-
-    lights = [np.full((16, 32, 3), value, np.float32) for value in (0.2, 0.8)]
+def test_the_trivial_rows_constants_are_measured(tmp_path: Path) -> None:
+    covered = np.zeros((8, 8), np.float32)
+    covered[2:5] = 1
+    shared = {"mask.Y": covered, **{f"albedo.{c}": covered * np.float32(0.25) for c in "RGB"}}
+    shared |= {f"normal.{axis}": covered * np.float32(n) for axis, n in zip("XYZ", (0.6, 0, 0.8), strict=True)}
+    files = {"a.shared.exr": exr_bytes(shared, half=False)}
+    for i, value in enumerate((0.2, 0.8)):
+        light = {c: np.full((16, 32), value, np.float32) for c in "RGB"}
+        files[f"a.l{i}.environment.exr"] = exr_bytes(light, half=False)
     with tarfile.open(tmp_path / "shard-000000.tar", "w") as tar:
-        for i, light in enumerate(lights):
-            path = write_one(tmp_path, light)
-            info = tarfile.TarInfo(f"a.l{i}.environment.exr")
-            info.size = path.stat().st_size
-            tar.addfile(info, io.BytesIO(path.read_bytes()))
+        for name, content in files.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(content)
+            tar.addfile(info, io.BytesIO(content))
     (tmp_path / "manifest.json").write_text(json.dumps({"config": {"split": "train", "seed": 3, "resolution": 32}}))
-    assert len(list(light_means(tmp_path))) == 2
-    text = write_statistics(tmp_path, tmp_path / "out.toml")
-    assert "[0.5000, 0.5000, 0.5000]" in text  # rows alike, as bright as the lights' mean
-    assert "2 lights" in text
+    of_objects, of_lights = map(tomllib.loads, measure(tmp_path).values())
+    np.testing.assert_allclose(of_objects["albedo_srgb"], 0.5371, rtol=0, atol=1e-4)  # 0.25, encoded
+    assert of_objects["normal"] == [0.6, 0.0, 0.8]
+    assert "1 training groups (split train, seed 3, 32 px)" in of_objects["provenance"]
+    assert of_lights["rows"] == [[0.5, 0.5, 0.5]] * 16  # alike, as bright as the lights' mean
+    assert "2 lights" in of_lights["provenance"]
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(UnirenderError, match="no shard"):
-        write_statistics(empty, tmp_path / "out2.toml")
-    assert not (tmp_path / "out2.toml").exists()
-
-
-def write_one(folder: Path, light: np.ndarray) -> Path:
-    write_environment(folder / "one.exr", light)
-    return folder / "one.exr"
+        measure(empty)
 
 
 def test_a_light_from_a_folder(suite: Suite, tmp_path: Path) -> None:

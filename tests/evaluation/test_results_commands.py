@@ -122,12 +122,12 @@ def test_intervals_of_tables_may_be_over_lights_too(bench, files: tuple[Path, Pa
     assert status == 0
     assert "interval: 95% over objects and lights, both as draws: two-way clusters, Student's t" in out
     assert "or under fewer than 5 lights, have no ±" in out
-    older = small_document()
-    del older["lights"]
-    path = written(files[0].with_name("older.json"), older)
+    unnamed = small_document()
+    del unnamed["lights"]
+    path = written(files[0].with_name("unnamed.json"), unnamed)
     status, out, err = bench("tables", path, "--interval", "objects-and-lights")
     assert (status, out) == (1, "")
-    assert "samples are not named; `python -m unirender_evaluation.results.lights SUITE results.json` names them" in err
+    assert "samples are not named, and the very suite is not installed, which would tell them; leave it out" in err
 
 
 def test_verdict_in_every_format(bench, files: tuple[Path, Path]) -> None:

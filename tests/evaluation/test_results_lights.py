@@ -1,15 +1,13 @@
-"""The lights of samples: from the suite, into files that do not name them, and what is read from them."""
+"""The lights of samples: from the suite where a file does not name them, and what is read from them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from small_results import small_results
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import Selection, difference_over_lights, over_lights
-from unirender_evaluation.results.file import read_results, write_results
-from unirender_evaluation.results.lights import lights_of, main, sample_lights, with_lights
+from unirender_evaluation.results.lights import lights_of, sample_lights
 from unirender_evaluation.results.merge import merged_lights
 from unirender_evaluation.suites.suite import load_suite, material_key
 
@@ -26,26 +24,15 @@ def test_a_sample_has_the_light_of_its_scene_and_that_which_it_is_relit_by() -> 
     assert lights[other.key] == (other.light, first.light), "what is asked of a scene as a whole relights it, too"
 
 
-def test_a_file_without_lights_gets_those_of_its_suite_and_stays_as_it_is_otherwise(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_of_a_file_without_lights_those_of_its_suite_count() -> None:
     suite = load_suite("tiny")
-    scene, path = suite.scenes[0], tmp_path / "results.json"
+    scene = suite.scenes[0]
     of_tiny = small_results(suite="tiny", suite_hash=suite.sha256, resolution=64, methods=("ours-mean",))
     record = replace(of_tiny.records[0], sample=f"{scene.key}_{material_key(scene.materials[0])}", object=scene.object)
-    write_results(path, of_tiny.run, [record])
-    before = read_results(path)
-    assert before.lights == {}
-    assert lights_of([before]) == sample_lights(suite), "the commands take them from the suite"
-    elsewhere = replace(before, run=replace(before.run, suite_hash="0" * 64))
+    unnamed = replace(of_tiny, records=(record,), lights={})
+    assert lights_of([unnamed]) == sample_lights(suite)
+    elsewhere = replace(unnamed, run=replace(unnamed.run, suite_hash="0" * 64))
     assert lights_of([elsewhere]) == {}, "of another truth nothing is known"
-    assert main(["tiny", str(path)]) == 0
-    assert read_results(path) == replace(before, lights={record.sample: (scene.light,)})
-    assert capsys.readouterr().out == f"{path}: the lights of 1 samples\n"
-    with pytest.raises(UnirenderError, match="is of suite ball 0123456789ab, expected tiny"):
-        with_lights(small_results(), suite)
-    assert (main(["tiny"]), main(["tiny", str(tmp_path / "gone.json")])) == (1, 1)
-    assert "gone.json: no such file" in capsys.readouterr().err
 
 
 def test_values_of_samples_whose_lights_are_not_named_have_no_interval_over_them() -> None:
@@ -53,5 +40,5 @@ def test_values_of_samples_whose_lights_are_not_named_have_no_interval_over_them
     albedo = Selection("inverse", "single-image").of(results.records)
     found = difference_over_lights(albedo, PSNR, "ours-mean", "input-as-albedo", merged_lights([results]))
     assert (found.mean, found.n, found.clusters) == (8, 4, 3)
-    with pytest.raises(UnirenderError, match="the lights of 'ball-0_l0' and 1 more samples are not named; `python -m"):
+    with pytest.raises(UnirenderError, match="the lights of 'ball-0_l0' and 1 more samples are not named, and"):
         over_lights({"ball-0_l0": 1.0, "ball-2_l0": 2.0}, albedo, {})

@@ -77,7 +77,11 @@ def test_a_part_follows_its_variables(package: Path, monkeypatch: pytest.MonkeyP
             ("light_balls.py", "light_metrics.py", "methods/light.py", "methods/trivial.py", "methods/composite.py"),
         ),
         ("core", "unirender_evaluation", ("methods/method.py", "predictions/folder.py", "suites/suite.py")),
-        ("core", "unirender_reference", ("lights/files.py", "lights/light.py")),
+        (
+            "core",
+            "unirender_reference",
+            ("lights/files.py", "lights/light.py", "lights/photograph.py", "lights/radiance.py"),
+        ),
     ],
 )
 def test_what_results_depend_on_is_covered(part: str, package: str, files: tuple[str, ...]) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from unirender.errors import UsageError
 from unirender_reference import backend
 from unirender_reference.measure.census import KINDS, census_of_object, classify, draw_renders
 from unirender_reference.measure.census_command import Census, band
@@ -96,9 +95,3 @@ def test_command_counts_in_worker_processes(tmp_path: Path, capsys: pytest.Captu
     assert "3 renders of 1 objects (3 calls of mi.render, 1.73e+03 camera paths)" in printed
     assert "0 bad values in what was handed out" in printed
     assert json.loads(out.read_text()) == []
-
-
-@pytest.mark.parametrize("options", [{"renders": 0}, {"spp": -1}, {"workers": -1}, {"json": Path("no/such/x.json")}])
-def test_command_refuses_what_makes_no_sense(options: dict) -> None:
-    with pytest.raises(UsageError):
-        Census(**options).run()

@@ -2,7 +2,6 @@
 
 import pytest
 
-from unirender.errors import UsageError
 from unirender_reference.measure.cost import FILES, PARTS, Cost, Figures, plans
 
 
@@ -34,10 +33,3 @@ def test_the_command_prints_what_it_measured(capsys: pytest.CaptureFixture[str])
     assert {"image", "specular", "diffuse", "(s)", "(kB)", "(MB)"} <= set(printed.split())
     assert "1,000 objects x 121 pairs, 16 groups a shard" in printed
     assert printed.count("sweep, one light") == 1
-
-
-def test_nothing_to_measure_is_a_usage_error() -> None:
-    with pytest.raises(UsageError, match="expected at least 1"):
-        Cost(resolutions=()).run()
-    with pytest.raises(UsageError, match="expected at least 1"):
-        Cost(scenes=0).run()

@@ -15,7 +15,7 @@ from unirender_reference import lights
 from unirender_reference.lights.summary import light_row
 from unirender_reference.measure.exposure import Exposure, picture_exposure
 from unirender_reference.measure.lights import THUMBNAIL, Lights
-from unirender_reference.sheets import LIGHT, captioned_sheet, environment_preview, table_sheet
+from unirender_reference.sheets import GAP, LINE, captioned_sheet, environment_preview, table_sheet
 
 
 def printed(command: Lights, capsys: pytest.CaptureFixture[str], status: int = 0) -> dict:
@@ -212,17 +212,17 @@ def test_sheets_hold_their_tiles_and_labels() -> None:
     for value in (0, 64, 191):
         assert (sheet == value).all(axis=-1).sum() >= 200
     table = np.asarray(table_sheet([tiles], ["row\nlabel\nof three"], ["x", "y", "a long label"]))
-    assert table.shape[0] >= 4 * LIGHT.line  # tiles are smaller than the labels
+    assert table.shape[0] >= 4 * LINE  # tiles are smaller than the labels
     for value in (0, 64, 191):
         assert (table == value).all(axis=-1).sum() >= 200
     assert (table[:, 10:30] < 100).any()  # the row's label
 
 
 def test_captions_are_broken_between_words_not_cut() -> None:
-    tile, line = np.ones((10, 80, 3), np.float32), LIGHT.line
+    tile, line = np.ones((10, 80, 3), np.float32), LINE
     low, high = (captioned_sheet([tile, tile], [words, "a"], 2) for words in ("twins", "train, CC0, twins studio"))
     assert high.height == low.height + line  # two lines instead of one
-    under = np.asarray(high)[-line:, : 80 + LIGHT.gap]
+    under = np.asarray(high)[-line:, : 80 + GAP]
     assert (under < 100).any()  # the last words stand there
     assert captioned_sheet([tile], ["w" * 99], 1).height == low.height  # one word has one line
 

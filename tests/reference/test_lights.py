@@ -14,7 +14,7 @@ from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_exr
 from unirender.light.environment import environment_directions, mean_radiance, sample_environment, texel_solid_angles
 from unirender_reference import lights
-from unirender_reference.lights import files
+from unirender_reference.lights import photograph
 from unirender_reference.lights.convert import PACKAGES, convert
 from unirender_reference.lights.light import area_resampled
 
@@ -260,7 +260,9 @@ def test_a_constant_file_keeps_its_radiance(tmp_path):
     write_exr(tmp_path / "map.exr", image_channels(np.full((16, 32, 3), 2.5, np.float32)))
     np.testing.assert_allclose(lights.load_light(tmp_path / "map.exr", normalise=False).environment, 2.5, rtol=1e-6)
     Image.fromarray(np.full((90, 180, 3), 255, np.uint8)).save(tmp_path / "white.png")
-    assert lights.load_light(tmp_path / "white.png", normalise=False).environment.max() == pytest.approx(files.PEAK)
+    assert lights.load_light(tmp_path / "white.png", normalise=False).environment.max() == pytest.approx(
+        photograph.PEAK
+    )
 
 
 def test_grey_exr_is_white_light(tmp_path):
@@ -287,12 +289,12 @@ def test_negative_lobes_are_counted(tmp_path):
 
 def test_photograph_range_rule():
     ramp = np.linspace(0, 1, 101)[None, :, None].repeat(3, -1).astype(np.float32)
-    expanded = files.expand_range(ramp)[0, :, 0]
-    below = ramp[0, :, 0] <= files.KNEE
+    expanded = photograph.expand_range(ramp)[0, :, 0]
+    below = ramp[0, :, 0] <= photograph.KNEE
     np.testing.assert_allclose(expanded[below], ramp[0, below, 0], rtol=1e-6)
-    assert expanded[-1] == pytest.approx(files.PEAK)
+    assert expanded[-1] == pytest.approx(photograph.PEAK)
     assert (np.diff(expanded) > 0).all()
-    colored = files.expand_range(np.array([[[1.0, 0.5, 0.25]]], np.float32))[0, 0]
+    colored = photograph.expand_range(np.array([[[1.0, 0.5, 0.25]]], np.float32))[0, 0]
     assert colored / colored[0] == pytest.approx([1, 0.5, 0.25])
 
 
@@ -329,7 +331,7 @@ def test_a_photograph_spans_180_degrees_of_the_horizon_and_45_up_and_down(row, c
     picture = np.zeros((100, 200, 3), np.float32)
     top, left = round(100 * row), round(200 * column)
     picture[top - 3 : top + 3, left - 3 : left + 3] = 1
-    environment = files.photograph_environment(picture, (64, 128))
+    environment = photograph.photograph_environment(picture, (64, 128))
     directions = environment_directions(64, 128)
     energy = environment.sum(-1) * texel_solid_angles(64, 128) * (directions[..., 2] > 0)
     x, y, z = (energy[..., None] * directions).sum((0, 1))
@@ -340,17 +342,17 @@ def test_a_photograph_spans_180_degrees_of_the_horizon_and_45_up_and_down(row, c
 def test_of_a_tall_photograph_the_middle_is_taken():
     picture = np.full((200, 100, 3), 5, np.float32)
     picture[75:125] = 1  # 90 degrees high where the width is 180
-    assert files.photograph_environment(picture, (64, 128)).max() == pytest.approx(1)
+    assert photograph.photograph_environment(picture, (64, 128)).max() == pytest.approx(1)
 
 
 def test_beyond_a_photograph_its_edge_fades_over_30_degrees_to_its_mean():
     """Left half white, right half black; the floor is darkened as it fades."""
     picture = np.zeros((100, 200, 3), np.float32)
     picture[:, :100] = 1
-    environment = files.photograph_environment(picture, (64, 128))
+    environment = photograph.photograph_environment(picture, (64, 128))
     for elevation, faded in ((50, 1 / 6), (60, 0.5), (70, 5 / 6), (80, 1)):
         for side, edge in ((1, 1), (-1, 0)):  # left is +x
-            for up, light in ((1, 1), (-1, 1 - (1 - files.FLOOR) * faded)):
+            for up, light in ((1, 1), (-1, 1 - (1 - photograph.FLOOR) * faded)):
                 horizontal, y = np.cos(np.radians(elevation)), up * np.sin(np.radians(elevation))
                 direction = np.array([side * horizontal / np.sqrt(2), y, horizontal / np.sqrt(2)])
                 expected = (edge * (1 - faded) + 0.5 * faded) * light
@@ -362,7 +364,7 @@ def test_a_grey_photograph_has_an_even_sky_and_a_darker_floor(tmp_path):
     Image.fromarray(np.full((90, 180, 3), 128, np.uint8)).save(tmp_path / "grey.png")
     e = lights.load_light(tmp_path / "grey.png").environment
     assert np.ptp(e[:90]) < 1e-3 * e.max()
-    assert e[-1] / e[0] == pytest.approx(files.FLOOR, rel=1e-3)
+    assert e[-1] / e[0] == pytest.approx(photograph.FLOOR, rel=1e-3)
 
 
 def test_a_picture_seen_in_the_window_stands_upright_and_unmirrored(tmp_path):

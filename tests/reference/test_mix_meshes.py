@@ -374,7 +374,7 @@ def test_bad_options(tmp_path):
     meshes = str(folder_of_boxes(tmp_path))
     with pytest.raises(UsageError, match="got no folder"):
         MixMeshes((), tmp_path / "out").check()
-    with pytest.raises(UsageError, match="--count: got 0, expected at least 1"):
+    with pytest.raises(UsageError, match="--count 0: expected 1 or more"):
         MixMeshes((meshes,), tmp_path / "out", count=0).check()
     with pytest.raises(UsageError, match="--holdout: got 1, expected 0 or at least 2"):
         MixMeshes((meshes,), tmp_path / "out", holdout=1).check()

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from unirender.color import srgb_encode
-from unirender.errors import UsageError
 from unirender_evaluation.metrics import psnr
 from unirender_reference.measure.shade_ceiling import MODES, ShadeCeiling, masked_psnr, measure
 
@@ -26,10 +25,3 @@ def test_shadows_bring_the_shaded_maps_closer() -> None:
     scores = measure(config, 0)[0.6, 0.5]
     assert set(scores) == {*MODES, "floor"}
     assert scores["alone"] < scores["shadows"] < scores["one bounce"] < scores["floor"] + 3
-
-
-def test_values_outside_the_range_are_a_usage_error() -> None:
-    with pytest.raises(UsageError, match=r"expected values in \[0, 1\]"):
-        ShadeCeiling(roughness=(1.5,)).run()
-    with pytest.raises(UsageError, match="at least 1 object"):
-        ShadeCeiling(objects=0).run()

@@ -33,12 +33,12 @@ SAID = {
 }
 AXIS_COLOURS = {"+x": "#c23b22", "+y": "#2e7d32", "+z": "#1f5fbf"}
 INK, SOFT = "#222222", "#888888"
-DPI = 120
+WIDTH, DPI = 5, 120  # inches, pixels an inch
 
 
 def maps_figure(suite: Suite, scene: Scene) -> "Figure":
     """The picture of a scene's base material and all maps that explain it, each as `map_picture` shows it."""
-    figure, maps = _figure(5, 5.9), suite.intrinsics(scene, suite.spec.base)
+    figure, maps = _figure(5.9), suite.intrinsics(scene, suite.spec.base)
     mask = maps.require("mask")["mask"]
     image = image_srgb(suite.image(scene, suite.spec.base) + (1 - mask))  # premultiplied, so over white by a sum
     shown = {"image": (image, "3, linear, premultiplied")}
@@ -59,7 +59,7 @@ def maps_figure(suite: Suite, scene: Scene) -> "Figure":
 
 def camera_figure(camera: Camera) -> "Figure":
     """The scene from above, the picture as the camera takes it, and the directions of an environment's texels."""
-    figure = _figure(5, 9.2)
+    figure = _figure(9.2)
     grid = figure.add_gridspec(3, 1, height_ratios=(1.1, 1.05, 1))
     _from_above(figure.add_subplot(grid[0]), camera)
     _picture(figure.add_subplot(grid[1]), camera)
@@ -83,10 +83,10 @@ def ball(camera: Camera, side: int) -> Float[np.ndarray, "side side 3"]:
     return np.where((under > 0)[..., None], hits, 0).astype(np.float32)
 
 
-def _figure(width: float, height: float) -> "Figure":
+def _figure(height: float) -> "Figure":
     from matplotlib.figure import Figure
 
-    return Figure((width, height), layout="constrained", facecolor="white")
+    return Figure((WIDTH, height), layout="constrained", facecolor="white")
 
 
 def _from_above(axes: "Axes", camera: Camera) -> None:

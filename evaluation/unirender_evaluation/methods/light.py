@@ -7,8 +7,8 @@ import numpy as np
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation.light_metrics import SHAPE
-from unirender_evaluation.light_statistics import light_statistics
 from unirender_evaluation.methods.method import Image, Mask, seen_linear
+from unirender_evaluation.training_statistics import light_statistics
 from unirender_reference.optimize.single.config import COLD
 
 

@@ -52,24 +52,32 @@ def solution_looks(scene: MultiviewScene, solution: Solution) -> Looks:
 
 
 def score_solution(
-    scene: MultiviewScene, solution: Solution, networks: Sequence[Lpips] = (), looks: Looks | None = None
+    scene: MultiviewScene,
+    solution: Solution,
+    networks: Sequence[Lpips] = (),
+    looks: Looks | None = None,
+    own_outline: bool = False,
 ) -> dict[str, float]:
-    """Metric key -> value of a result."""
+    """Metric key -> value of a result; `own_outline`: its mesh is another than the true one."""
     looks = solution_looks(scene, solution) if looks is None else looks
-    values = score_maps(looks.buffers.replace(normal=None, mask=None), scene.buffers)
+    buffers = looks.buffers if own_outline else looks.buffers.replace(mask=None)
+    values = score_maps(buffers.replace(normal=None), scene.buffers)
     values = {key: value for key, value in values.items() if not any(name in key for name in NEIGHBOURS)}
     values |= light_values(solution.environment, scene.light)
     for what, found, truth in (("novel", looks.novel, scene.novel), ("relit", looks.relit, scene.relit)):
-        values |= picture_values(what, found, truth, networks)
+        values |= _picture_values(what, found, truth, networks, own_outline)
     return values
 
 
-def picture_values(what: str, found: LitPictures, truth: LitPictures, networks: Sequence[Lpips]) -> dict[str, float]:
+def _picture_values(
+    what: str, found: LitPictures, truth: LitPictures, networks: Sequence[Lpips], own_outline: bool
+) -> dict[str, float]:
     """Scores of each camera's picture under `<what>_<camera>`, and their means under `<what>`."""
     values: dict[str, float] = {}
     for index in range(len(truth.pictures)):
-        own = f"{what}_{index}"
-        values |= score_image(found.rgb(index), truth.rgb(index), truth.mask(index), quantity=own, lpips=networks)
+        own = np.asarray(found.mask(index), np.float32) if own_outline else None
+        parts = found.rgb(index), truth.rgb(index), truth.mask(index)
+        values |= score_image(*parts, prediction_mask=own, quantity=f"{what}_{index}", lpips=networks)
     return values | camera_means(what, values, len(truth.pictures))
 
 

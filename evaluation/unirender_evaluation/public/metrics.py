@@ -196,11 +196,11 @@ def _in_range(value: Any, most: float, least: float = 0) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= most
 
 
-def whdr(albedo_linear: Rgb, judged: Sequence[Judgement], delta: float = DELTA) -> dict[str, float]:
+def whdr(albedo_linear: Rgb, judged: Sequence[Judgement]) -> dict[str, float]:
     """Weighted human disagreement rate of an albedo of any size.
 
     The reflectance of a point is the mean of its pixel's linear channels, at least `LEAST_REFLECTANCE`; point 1 is
-    darker where r2 / r1 > 1 + delta, point 2 where r1 / r2 > 1 + delta, else they are equal.
+    darker where r2 / r1 > 1 + `DELTA`, point 2 where r1 / r2 > 1 + `DELTA`, else they are equal.
 
     Returns:
         "whdr", sum of the contradicted weights over the sum of all, in [0, 1]; the same of the pairs that people called
@@ -209,7 +209,7 @@ def whdr(albedo_linear: Rgb, judged: Sequence[Judgement], delta: float = DELTA) 
     sums = {name: np.zeros(2) for name in ("whdr", "whdr_equal", "whdr_unequal")}
     for item in judged:
         r1, r2 = (_reflectance(albedo_linear, point) for point in (item.first, item.second))
-        said = "1" if r2 / r1 > 1 + delta else "2" if r1 / r2 > 1 + delta else "E"
+        said = "1" if r2 / r1 > 1 + DELTA else "2" if r1 / r2 > 1 + DELTA else "E"
         counted = np.array([item.weight * (said != item.darker), item.weight])
         sums["whdr"] += counted
         sums["whdr_equal" if item.darker == "E" else "whdr_unequal"] += counted

@@ -8,7 +8,7 @@ their interval holds the mean of all: Student's t, which `statistics` has, and a
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 
@@ -105,7 +105,7 @@ def stored_differences(results: Results) -> list[Objects]:
     return found
 
 
-def coverage_of_draws(objects: Objects, count: int, draws: int = DRAWS, seed: int = 0) -> tuple[float, float]:
+def coverage_of_draws(objects: Objects, count: int, draws: int, seed: int = 0) -> tuple[float, float]:
     """Shares of Student's intervals and of the bootstrap's of `count` objects that hold the mean of all.
 
     Args:
@@ -149,25 +149,25 @@ def lights_table(structures: Mapping[str, Samples]) -> str:
     return markdown_table(head, lines)
 
 
-def draws_table(results: Results, counts: Sequence[int] = COUNTS, draws: int = DRAWS) -> str:
+def draws_table(results: Results) -> str:
     """Coverage by how many objects of stored results are drawn, in percent: the mean over the differences that claims
     are about, Student's t / bootstrap, and Student's of the one that it holds least often."""
     found = stored_differences(results)
     held = 100 * np.array(
-        [[coverage_of_draws(objects, count, draws, seed) for count in counts] for seed, objects in enumerate(found)]
+        [[coverage_of_draws(objects, count, DRAWS, seed) for count in COUNTS] for seed, objects in enumerate(found)]
     )
     means = [f"{student:.1f} / {resampled:.1f}" for student, resampled in held.mean(axis=0)]
     least = [f"{student:.1f}" for student in held[:, :, 0].min(axis=0)]
     lines = [[f"mean of {len(found)} differences", *means], ["the least of them, Student's t", *least]]
-    low, high = least_by_chance(len(found), draws)
+    low, high = least_by_chance(len(found), DRAWS)
     return (
-        f"{markdown_table([f'objects of {results.run.suite}', *map(str, counts)], lines)}\n"
+        f"{markdown_table([f'objects of {results.run.suite}', *map(str, COUNTS)], lines)}\n"
         f"Of {len(found)} that hold as often as they say, each for itself, the least would be {100 * low:.1f} to "
         f"{100 * high:.1f}."
     )
 
 
-def least_by_chance(numbers: int, draws: int = DRAWS) -> tuple[float, float]:
+def least_by_chance(numbers: int, draws: int) -> tuple[float, float]:
     """Between which shares the least of so many lies in 95 of 100 cases, if all intervals hold as often as they say.
 
     Args:

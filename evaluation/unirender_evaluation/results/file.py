@@ -4,7 +4,7 @@
     schema        version of this layout
     run           suite, hashes, versions, one entry for each row of the tables (`records.RunInfo`)
     definitions   what each protocol gives a method, and each metric's formula and direction, as they were in the run
-    lights        the lights that each sample's values depend on, one a line; files of before December 2026 lack it
+    lights        the lights that each sample's values depend on, one a line; absent where they are not known
     records       every value of every row on every sample (`records.Record`), one a line
 
 `bench run` writes it at its end, beside the `run.json` and `records.jsonl` that it is made from. One whose name ends in

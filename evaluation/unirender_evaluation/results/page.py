@@ -28,7 +28,6 @@ from unirender_evaluation.results.findings import (
     together,
 )
 from unirender_evaluation.results.groups import by_kind, by_material, by_object, by_scale
-from unirender_evaluation.results.lights import with_lights
 from unirender_evaluation.results.questions import (
     BOTH_SIZES,
     BY_KIND,
@@ -136,8 +135,7 @@ class Page:
 
     def under_other_lights(self) -> Shown:
         """The verdict on each claim, over objects and over objects and lights."""
-        known = with_lights(self.standard, self.suite)
-        table = claims_table(known.run, known.records, known.lights, stated=False)
+        table = claims_table(self.standard.run, self.standard.records, self.standard.lights, stated=False)
         return Shown(table.markdown().partition("\n\n")[2])  # without its title
 
     @cached_property

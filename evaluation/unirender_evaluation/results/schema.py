@@ -113,7 +113,7 @@ def json_schema() -> dict[str, Any]:
         "$schema": DIALECT,
         "title": "Results of a unirender benchmark run: its description and every per-sample value",
         **whole,
-        "required": [name for name in whole["required"] if name != "lights"],  # which older files lack
+        "required": [name for name in whole["required"] if name != "lights"],  # which are not known of all
         "$defs": {"method": _of_dataclass(MethodInfo), "record": record, "run": run},
     }
 

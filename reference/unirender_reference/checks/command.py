@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from unirender.errors import UsageError
 from unirender.system.wording import one_of
 from unirender_reference.measure.output import check_file, write_file
+from unirender_reference.option_checks import require_least
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -42,14 +43,11 @@ class Check:
         names = self.only or tuple(CHECKS)
         if unknown := [name for name in names if name not in CHECKS]:
             raise UsageError(f"--only: got {', '.join(unknown)}, expected some of {', '.join(CHECKS)}")
-        if self.seed < 0:
-            raise UsageError(f"--seed: got {self.seed}, expected 0 or more")
+        require_least(self, "", {"seed": 0})
         if self.perturb is not None and self.perturb not in PERTURBATIONS:
             raise UsageError(f"--perturb: got {self.perturb}, {one_of(self.perturb, PERTURBATIONS)}")
         if self.twins and self.perturb is not None:
             raise UsageError("--twins runs every perturbation: leave --perturb out")
-        if self.json is not None and not self.json.absolute().parent.is_dir():
-            raise UsageError(f"--json: got {self.json}, expected a file in an existing folder")
         check_file("--json", self.json)
         return self._twins(names) if self.twins else self._table(names)
 

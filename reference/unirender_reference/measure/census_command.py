@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from unirender.errors import UsageError
 from unirender_reference.measure.output import check_file, write_file
+from unirender_reference.option_checks import require_least
 
 if TYPE_CHECKING:
     from unirender_reference.measure.census import BadPixel, ObjectCensus
@@ -37,14 +37,7 @@ class Census:
         from rich.console import Console
         from rich.table import Table
 
-        for name in ("renders", "resolution", "spp"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"--{name}: got {getattr(self, name)}, expected at least 1")
-        for name in ("seed", "workers"):
-            if getattr(self, name) < 0:
-                raise UsageError(f"--{name}: got {getattr(self, name)}, expected 0 or more")
-        if self.json is not None and not self.json.absolute().parent.is_dir():
-            raise UsageError(f"--json: got {self.json}, expected a file in an existing folder")
+        require_least(self, "", {"renders": 1, "resolution": 1, "spp": 1, "seed": 0, "workers": 0})
         check_file("--json", self.json)
         from unirender_reference.measure.census import KINDS, RENDERS_PER_OBJECT, run_census, timed
 

@@ -13,7 +13,6 @@ from unirender_reference.measure.exposure import Exposure
 from unirender_reference.measure.noise_floor import NoiseFloor
 from unirender_reference.measure.passes import Passes
 from unirender_reference.measure.shade_ceiling import ShadeCeiling
-from unirender_reference.measure.shape import ShapeMeasure
 from unirender_reference.measure.sweep import SweepMeasure
 
 
@@ -31,7 +30,6 @@ class Reference:
         | Annotated[Cost, tyro.conf.subcommand("cost")]
         | Annotated[Exposure, tyro.conf.subcommand("exposure")]
         | Annotated[Sheet, tyro.conf.subcommand("sheet")]
-        | Annotated[ShapeMeasure, tyro.conf.subcommand("shape")]
     ] = field()
 
     def run(self) -> int:

@@ -3,11 +3,12 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-from unirender.errors import UnirenderError, UsageError
+from unirender.errors import UsageError
 from unirender.system.wording import counted
 from unirender_reference.measure.output import check_file, png_bytes, write_file
+from unirender_reference.option_checks import require_least
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,8 +31,6 @@ class Sheet:
     """Procedural objects; every second one has roughness, metallic and normal maps, the others one value each."""
     mesh: tuple[Path, ...] = ()
     """Mesh files (GLB, glTF, OBJ, PLY, STL, OFF) for more rows, with their own materials where they have some."""
-    background: Literal["light", "dark"] = "light"
-    """Neutral grey of the page, which the image is composited over."""
     resolution: int = 112
     """Pixels along each side of a tile."""
     spp: int = 512
@@ -42,27 +41,20 @@ class Sheet:
     def run(self) -> int:
         """Renders and writes the sheet; returns the exit status."""
         from unirender_reference.render import render_sample
-        from unirender_reference.sheets import DARK, LIGHT, table_sheet
+        from unirender_reference.sheets import table_sheet
 
-        if self.objects < 0 or self.objects + len(self.mesh) == 0:
-            raise UsageError(f"--objects {self.objects}: expected at least one object or --mesh")
-        if self.resolution < 16 or self.spp < 8 or self.spp % 8 or self.seed < 0:
-            raise UsageError(
-                f"--resolution {self.resolution}, --spp {self.spp}, --seed {self.seed}: expected at least 16 px, a "
-                "multiple of 8 samples, a seed of 0 or more"
-            )
-        if not self.out.absolute().parent.is_dir():
-            raise UnirenderError(f"{self.out}: no such folder, expected one to write the sheet into; make it first")
+        require_least(self, "", {"objects": 0 if self.mesh else 1, "resolution": 16, "spp": 8, "seed": 0})
+        if self.spp % 8:
+            raise UsageError(f"--spp {self.spp}: expected a multiple of 8")
         check_file("--out", self.out)
         if self.out.suffix.lower() != ".png":
             raise UsageError(f"--out {self.out}: expected the name of a PNG file, like {self.out.with_suffix('.png')}")
         specs = list(self.specs())  # a mesh that cannot be read is told before anything is rendered
-        style = LIGHT if self.background == "light" else DARK
         rows, labels = [], []
         for spec in specs:
-            rows.append(buffer_tiles(render_sample(spec, self.spp), style.background))
+            rows.append(buffer_tiles(render_sample(spec, self.spp)))
             labels.append(_label(spec))
-        write_file("--out", self.out, png_bytes(table_sheet(rows, labels, COLUMNS, style)))
+        write_file("--out", self.out, png_bytes(table_sheet(rows, labels, COLUMNS)))
         print(f"{self.out}: {counted(len(rows), 'object')} x {len(COLUMNS)} buffers, {self.spp} spp")
         return 0
 
@@ -89,7 +81,7 @@ class Sheet:
             )
 
 
-def buffer_tiles(sample: "Sample", background: float) -> "list[np.ndarray]":
+def buffer_tiles(sample: "Sample") -> "list[np.ndarray]":
     """Display values of the buffers in the order of `COLUMNS`.
 
     The image is composited in linear light over the background; the maps stand on checks about it, those of one channel
@@ -99,17 +91,16 @@ def buffer_tiles(sample: "Sample", background: float) -> "list[np.ndarray]":
 
     Args:
         sample: a complete sample.
-        background: display grey, [0, 1].
     """
     import numpy as np
 
     from unirender.color import image_srgb, srgb_decode
     from unirender.light.environment import resample_environment
-    from unirender_reference.sheets import environment_preview
+    from unirender_reference.sheets import BACKGROUND, environment_preview
 
     maps = sample.intrinsics.maps
     mask = maps["mask"]
-    grey = srgb_decode(np.array(background))
+    grey = srgb_decode(np.array(BACKGROUND))
     shown = {
         "albedo": image_srgb(maps["albedo"]),
         "normal": (maps["normal"] + 1) / 2,
@@ -120,7 +111,7 @@ def buffer_tiles(sample: "Sample", background: float) -> "list[np.ndarray]":
     }
     size = mask.shape[1]
     odd = (np.indices(mask.shape[:2]) // (size // CHECKS)).sum(axis=0)[..., None] % 2
-    under = background + CHECK_CONTRAST * (odd - 0.5) + np.zeros(3)
+    under = BACKGROUND + CHECK_CONTRAST * (odd - 0.5) + np.zeros(3)
     return [
         image_srgb(sample.image_linear + (1 - mask) * grey),
         *(mask * value + (1 - mask) * (under + TINT if value.shape[2] == 1 else under) for value in shown.values()),

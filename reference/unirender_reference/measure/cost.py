@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from unirender.errors import UsageError
 from unirender.system.wording import counted
 from unirender.system.worker_pool import WorkerPool
+from unirender_reference.option_checks import require_least
 
 if TYPE_CHECKING:
     from unirender_reference.render import Renderer
@@ -47,8 +48,10 @@ class Cost:
 
         from unirender_reference.plan import SHARD_GROUPS
 
-        if min((*self.resolutions, self.spp, self.scenes, self.objects), default=0) < 1 or not self.resolutions:
-            raise UsageError("expected at least 1 resolution, sample, scene and object")
+        require_least(self, "", {"spp": 1, "scenes": 1, "objects": 1})
+        if min(self.resolutions, default=0) < 1:
+            shown = " ".join(map(str, self.resolutions))
+            raise UsageError(f"--resolutions {shown}: expected one or more, each of 1 pixel or more")
         console = Console(width=160)
         names = {"s": "specular", "d": "diffuse"}  # beside seconds
         columns = [f"{names.get(name, name)} ({unit})" for unit, of in (("s", PARTS), ("kB", FILES)) for name in of]

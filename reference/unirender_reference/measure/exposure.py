@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from unirender.errors import UsageError
 from unirender.system.wording import counted
+from unirender_reference.option_checks import require_least
 
 if TYPE_CHECKING:
     import numpy as np
@@ -63,11 +63,7 @@ class Exposure:
         from rich.console import Console
         from rich.table import Table
 
-        for name in ("objects", "lights", "spp"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"--{name} {getattr(self, name)}: expected at least 1")
-        if self.seed < 0:
-            raise UsageError(f"--seed {self.seed}: expected 0 or more")
+        require_least(self, "", {"objects": 1, "lights": 1, "spp": 1, "seed": 0})
         scenes = list(self.scenes())
         groups = {"all": scenes}
         for kind in sorted({scene.light for scene in scenes}):

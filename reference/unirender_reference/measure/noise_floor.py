@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from unirender.errors import UsageError
 from unirender.system.worker_pool import WorkerPool
 from unirender_reference.measure.size import check_size
+from unirender_reference.option_checks import require_least
 from unirender_reference.processes import start_worker
 
 if TYPE_CHECKING:
@@ -127,13 +128,10 @@ class NoiseFloor:
             UsageError: one is outside its range.
             UnirenderError: the machine has not the memory for the resolution.
         """
-        for name in ("images", "factor", "resolution", "limit"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"--{name} {getattr(self, name)}: expected at least 1")
+        counts = dict.fromkeys(("images", "factor", "resolution", "limit"), 1)
+        require_least(self, "", counts | {"workers": 0, "seed": 0})
         if not 0 < self.floor < 100:
             raise UsageError(f"--floor {self.floor:g}: expected decibels above 0 and below 100")
-        if self.workers < 0 or self.seed < 0:
-            raise UsageError(f"--workers {self.workers}, --seed {self.seed}: expected 0 or more")
         check_size(self.resolution)
 
     def run(self) -> int:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from unirender.errors import UnirenderError, UsageError
 from unirender.system.writing import writing
 from unirender_reference.measure.output import ELSEWHERE
+from unirender_reference.option_checks import require_least
 
 if TYPE_CHECKING:
     import numpy as np
@@ -58,11 +59,7 @@ class Passes:
 
         from unirender.files import new_folder
 
-        if self.resolution < 8 or self.spp < 8 or self.object < 0:
-            raise UsageError(
-                f"--resolution {self.resolution}, --spp {self.spp}, --object {self.object}: expected at least 8 "
-                "pixels, 8 samples and a seed of 0 or more"
-            )
+        require_least(self, "", {"resolution": 8, "spp": 8, "object": 0})
         for name, value in (("roughness", self.roughness), ("metallic", self.metallic)):
             if value is not None and not 0 <= value <= 1:
                 raise UsageError(f"--{name} {value}: expected a value in [0, 1], or None for the object's own map")

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from unirender.errors import UsageError
+from unirender_reference.option_checks import require_least
 
 MODES = ("alone", "shadows", "one bounce")
 
@@ -38,10 +39,12 @@ class ShadeCeiling:
         from rich.console import Console
         from rich.table import Table
 
-        if min(self.objects, self.resolution, len(self.roughness), len(self.metallic)) < 1:
-            raise UsageError("expected at least 1 object, pixel, roughness and metallic value")
-        if not all(0 <= value <= 1 for value in (*self.roughness, *self.metallic)):
-            raise UsageError(f"got roughness {self.roughness} and metallic {self.metallic}, expected values in [0, 1]")
+        require_least(self, "", {"objects": 1, "resolution": 1, "spp": 1, "seed": 0})
+        for name in ("roughness", "metallic"):
+            values = getattr(self, name)
+            if not values or not all(0 <= value <= 1 for value in values):
+                shown = " ".join(f"{value:g}" for value in values)
+                raise UsageError(f"--{name} {shown}: expected one value or more, all in [0, 1]")
         cells = [measure(self, self.seed + index) for index in range(self.objects)]
         table = Table("metallic", "roughness", *MODES, "noise of truth")
         for metallic in self.metallic:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from unirender.errors import UsageError
+from unirender_reference.option_checks import require_least
 
 MOST_TIME = 0.3  # of the bare loop
 NOISE_SPP = 64  # of the pictures whose differences are compared
@@ -54,16 +55,9 @@ class SweepMeasure:
         from rich.console import Console
         from rich.table import Table
 
-        if self.levels < 2 or self.nodes not in (2, 3, 4) or self.batches < 2:
-            raise UsageError(
-                f"--levels {self.levels}, --nodes {self.nodes}, --batches {self.batches}: expected at least 2 levels, "
-                "2, 3 or 4 nodes, and at least 2 batches"
-            )
-        if self.resolution < 1 or self.spp < self.batches or self.seed < 0:
-            raise UsageError(
-                f"--resolution {self.resolution}, --spp {self.spp}, --seed {self.seed}: expected at least a pixel, a "
-                "sample in each batch, and a seed of 0 or more"
-            )
+        require_least(self, "", {"levels": 2, "batches": 2, "resolution": 1, "spp": self.batches, "seed": 0})
+        if self.nodes not in (2, 3, 4):
+            raise UsageError(f"--nodes {self.nodes}: expected 2, 3 or 4")
         if self.albedo is not None and not 0 <= self.albedo <= 1:
             raise UsageError(f"--albedo {self.albedo:g}: expected a value in [0, 1]")
         rows = self.measure()

@@ -16,8 +16,8 @@ from unirender.system.writing import writing
 from unirender_reference.measure.output import ELSEWHERE, full_disk
 from unirender_reference.optimize.machine import require_cores
 from unirender_reference.optimize.multiview.config import OptimizeConfig
-from unirender_reference.optimize.option_checks import require_least
 from unirender_reference.optimize.single.config import SingleConfig, kept_note
+from unirender_reference.option_checks import require_least
 
 if TYPE_CHECKING:
     import numpy as np

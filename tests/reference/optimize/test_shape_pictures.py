@@ -8,8 +8,7 @@ from posed_spheres import blank_views, dented_sphere, mask_views
 from reference_scenes import environment, sphere
 
 from unirender.color import image_srgb
-from unirender.errors import UnirenderError, UsageError
-from unirender_reference.measure.shape import ShapeMeasure
+from unirender.errors import UnirenderError
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.charts import unwrap, welded
 from unirender_reference.optimize.shape.config import ShapeConfig
@@ -230,19 +229,3 @@ def test_environment_is_used() -> None:
     inner = np.array([SIZE * (SIZE // 2) + SIZE // 2])
     one, two = (shade_points(_solution(obj, light * np.float32(k)), cameras, inner, 16, 0).radiance for k in (1, 2))
     np.testing.assert_allclose(two, 2 * one, rtol=1e-4)
-
-
-@pytest.mark.long
-def test_the_measure_scores_every_stage(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
-    shape = ShapeConfig(cells=20, mask_steps=2, image_steps=1, spp=4)
-    assert ShapeMeasure(objects=(5,), views=6, resolution=24, spp=16, shape=shape).run() == 0
-    printed = capsys.readouterr().out
-    assert all(stage in printed for stage in ("visual hull", "masks", "pictures", "true light"))
-
-
-def test_the_measure_refuses_what_it_cannot_do() -> None:
-    with pytest.raises(UsageError, match="at least 1 object"):
-        ShapeMeasure(objects=()).run()
-    with pytest.raises(UsageError, match=r"--views 1000000000000, --resolution 64: would take about .*; take fewer"):
-        ShapeMeasure(views=10**12).run()

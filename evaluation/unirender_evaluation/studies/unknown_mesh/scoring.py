@@ -12,13 +12,9 @@ Shape is scored from the held-out cameras, and from steep ones that look from wh
 
 import dataclasses
 
-import numpy as np
-
-from unirender_evaluation.light_metrics import light_values
 from unirender_evaluation.metrics import HIGHER, LOWER, Metric, metric_key
-from unirender_evaluation.multiview.scenes import LitPictures, MultiviewScene
-from unirender_evaluation.multiview.scoring import NEIGHBOURS, Looks, camera_means, solution_looks
-from unirender_evaluation.scoring import score_image, score_maps
+from unirender_evaluation.multiview.scenes import MultiviewScene
+from unirender_evaluation.multiview.scoring import Looks, score_solution
 from unirender_reference.multiview import pose_towards
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.measure import score_shape
@@ -48,13 +44,7 @@ CHAMFER = Metric(
 
 def score_found(scene: MultiviewScene, solution: Solution, looks: Looks | None = None) -> dict[str, float]:
     """Metric key -> value of a result with a mesh of its own."""
-    looks = solution_looks(scene, solution) if looks is None else looks
-    values = score_maps(looks.buffers.replace(normal=None), scene.buffers)
-    values = {key: value for key, value in values.items() if not any(name in key for name in NEIGHBOURS)}
-    values |= light_values(solution.environment, scene.light)
-    for what, found, truth in (("novel", looks.novel, scene.novel), ("relit", looks.relit, scene.relit)):
-        values |= _pictures(what, found, truth)
-    return values | shape_values(scene, solution.obj)
+    return score_solution(scene, solution, looks=looks, own_outline=True) | shape_values(scene, solution.obj)
 
 
 def shape_values(scene: MultiviewScene, found: MeshObject) -> dict[str, float]:
@@ -70,12 +60,3 @@ def shape_values(scene: MultiviewScene, found: MeshObject) -> dict[str, float]:
         values[metric_key(quantity, CHAMFER)] = score.chamfer  # of the whole surface, the same for both
     del values[metric_key(STEEP, CHAMFER)]
     return values
-
-
-def _pictures(what: str, found: LitPictures, truth: LitPictures) -> dict[str, float]:
-    values: dict[str, float] = {}
-    for index in range(len(truth.pictures)):
-        own = np.asarray(found.mask(index), np.float32)
-        parts = found.rgb(index), truth.rgb(index), truth.mask(index)
-        values |= score_image(*parts, prediction_mask=own, quantity=f"{what}_{index}")
-    return values | camera_means(what, values, len(truth.pictures))

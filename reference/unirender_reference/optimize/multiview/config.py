@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 
 from unirender.errors import UsageError
 from unirender_reference.optimize.machine import require_memory
-from unirender_reference.optimize.option_checks import require_least
 from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.shape.config import ShapeConfig
 from unirender_reference.optimize.transport.config import TransportConfig
+from unirender_reference.option_checks import require_least
 
 # Bytes of memory, measured with textures of 512 and 1024 texels, lights of 16 to 48 rows, and 3 and 7 pictures of 512 x
 # 512 pixels.

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from unirender.errors import UsageError
-from unirender_reference.optimize.option_checks import require_least, require_one_of
+from unirender_reference.option_checks import require_least, require_one_of
 
 LossKind = Literal["log", "srgb", "linear", "slope"]
 Space = Literal["perceptual", "linear"]

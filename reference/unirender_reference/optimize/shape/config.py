@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from unirender_reference.optimize.machine import require_memory
-from unirender_reference.optimize.option_checks import require_least
+from unirender_reference.option_checks import require_least
 
 POINT_BYTES = 180.0  # of memory for a point of the grid: measured with 64 to 192 cells
 

@@ -16,7 +16,7 @@ from unirender_reference.multiview import pose_towards
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.solution_scene import solution_images
 from unirender_reference.optimize.views import View, Views
-from unirender_reference.sheets import LIGHT, environment_preview, table_sheet
+from unirender_reference.sheets import BACKGROUND, environment_preview, table_sheet
 
 RELIT = ("blender-studio", "blender-sunset", "pmndrs-forest", "blender-night")
 TURNS, ELEVATION_DEG = 8, 15.0
@@ -87,5 +87,5 @@ def _enlarged(tile: Float[np.ndarray, "h w 3"], times: int) -> Float[np.ndarray,
 
 def _over(image_linear: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 3"]:
     """A premultiplied picture over the page: display values."""
-    page = srgb_decode(np.full((1, 1, 1), LIGHT.background, np.float32))
+    page = srgb_decode(np.full((1, 1, 1), BACKGROUND, np.float32))
     return image_srgb(image_linear + (1 - mask) * page)
