@@ -59,7 +59,7 @@ class MapFile:
 
 def _differs(name: str, shown: Float[np.ndarray, "h w c"], stored: Float[np.ndarray, "h w c"]) -> np.ndarray:
     levels, others = (eight_bits(picture).astype(np.int16) for picture in (shown, map_picture(name, stored)))
-    return (np.abs(levels - others) > SAME_LEVELS).any(axis=-1)
+    return np.abs(levels - others).max(axis=-1) > SAME_LEVELS
 
 
 def map_files(folder: Path) -> dict[str, Path]:
@@ -102,21 +102,24 @@ def read_maps(files: Mapping[str, Path]) -> dict[str, Float[np.ndarray, "h w c"]
     Raises:
         UnirenderError: a file is broken, of another size than the others, or no such map.
     """
-    read = {name: read_map_file(path, name) for name, path in files.items() if name != "mask"}
-    if not read:
+    values, alphas = {}, {}
+    for name in [name for name in files if name != "mask"]:
+        found = read_map_file(files[name], name)
+        values[name], alphas[name] = found.value, found.alpha
+    if not values:
         return {}
-    sizes = [found.value.shape[:2] for found in read.values()]
+    sizes = [value.shape[:2] for value in values.values()]
     size = max(sizes, key=sizes.count)
-    for name, found in read.items():
-        check_size(files[name], found.value, size)
+    for name, value in values.items():
+        check_size(files[name], value, size)
     mask = read_mask(files["mask"], size) if "mask" in files else None
     if mask is None:
-        mask = next((each.alpha for each in read.values() if each.alpha is not None), None)
+        mask = next((alphas[name] for name in IMAGE_MAPS if alphas.get(name) is not None), None)
     cover = np.ones((*size, 1), np.float32) if mask is None else mask
-    for name, found in read.items():
-        report_lost(files[name], name, found, cover > 0.5)
-    maps = {name: (found.value * (cover > 0)).astype(np.float32) for name, found in read.items()}
-    return maps if mask is None else maps | {"mask": mask}
+    for name, value in values.items():
+        _report_lost(files[name], name, value, alphas[name], cover > 0.5)
+        values[name] = np.where(cover > 0, value, 0)
+    return values if mask is None else values | {"mask": mask}
 
 
 def read_map_file(path: Path, name: str) -> MapFile:
@@ -148,16 +151,24 @@ def check_size(path: Path, value: Float[np.ndarray, "h w c"], size: tuple[int, .
         )
 
 
-def report_lost(path: Path, name: str, found: MapFile, inside: Bool[np.ndarray, "h w 1"]) -> None:
+def _report_lost(
+    path: Path,
+    name: str,
+    value: Float[np.ndarray, "h w c"],
+    alpha: Float[np.ndarray, "h w 1"] | None,
+    inside: Bool[np.ndarray, "h w 1"],
+) -> None:
     """Logs what a file cannot say of the object: where it is transparent, and radiance above display white."""
-    if found.alpha is not None and (hidden := float((found.alpha <= 0.5)[inside].mean())):
+    if alpha is not None and (hidden := float((alpha <= 0.5)[inside].mean())):
         logger.warning("%s: is transparent on %.3g%% of the object, where its hidden colour counts", path, 100 * hidden)
-    white = (found.shown.max(axis=-1, keepdims=True) >= DISPLAY_WHITE)[inside].mean()
-    if name in RADIANCE_MAPS and path.suffix.lower() != ".exr" and white:
+    if name not in RADIANCE_MAPS or path.suffix.lower() == ".exr":
+        return
+    white = value.max(axis=-1, keepdims=True) >= srgb_decode(np.array(DISPLAY_WHITE))
+    if share := float(white[inside].mean()):
         logger.warning(
             "%s: is at display white on %.3g%% of the object, where brighter light is lost: an EXR holds it",
             path,
-            100 * white,
+            100 * share,
         )
 
 
