@@ -228,7 +228,10 @@ def read_result(
     if path.is_dir() and not file.is_file():
         maps = _single_maps(path)
     elif not file.is_file() or file.suffix.lower() != ".exr":
-        raise UnirenderError(f"{path}: no folder and no EXR file, expected the output of `unirender decompose`")
+        raise UnirenderError(
+            f"{path}: no folder and no EXR file, expected the output of `unirender decompose` or a folder with a file "
+            "for each map"
+        )
     else:
         maps, attributes = _maps_of_exr(file, path)
     maps = maps.replace(camera=_camera(path, attributes, fov_deg))
@@ -268,6 +271,8 @@ def _single_maps(folder: Path) -> Intrinsics:
             f"`unirender decompose`{several}"
         )
     report_unread(folder)
+    if (picture := folder / "environment.png").is_file() and not (folder / ENVIRONMENT_FILE).is_file():
+        logger.warning("%s: not read: its values end at display white, expected %s", picture, ENVIRONMENT_FILE)
     maps = read_maps(files)
     try:
         return Intrinsics().replace(**maps)

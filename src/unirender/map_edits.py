@@ -52,7 +52,7 @@ def with_edits(stored: Intrinsics, folder: Path) -> Intrinsics:
         if known is None and name in RADIANCE_MAPS and stored.environment is not None:
             continue  # it follows from the light
         found = read_map_file(path, name)
-        check_size(path, found.value, size)
+        check_size(path, found.value, size, INTRINSICS)
         changed = inside if known is None else inside & found.differs(name, known)
         if changed.any():
             changes[name] = np.where(changed[..., None], found.value, 0 if known is None else known)
@@ -76,6 +76,6 @@ def _painted_light(stored: Intrinsics, folder: Path) -> np.ndarray | None:
     if light is None or not lit or not states(folder / INTRINSICS, LIGHT_ATTRIBUTE) or not picture.is_file():
         return None
     found = read_map_file(picture, "environment")
-    check_size(picture, found.value, light.shape[:2])
+    check_size(picture, found.value, light.shape[:2], "environment.exr")
     changed = found.differs("environment", light)
     return np.where(changed[..., None], found.value, light) if changed.any() else None

@@ -138,16 +138,18 @@ def read_map_file(path: Path, name: str) -> MapFile:
         raise UnirenderError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
 
-def check_size(path: Path, value: Float[np.ndarray, "h w c"], size: tuple[int, ...]) -> None:
+def check_size(
+    path: Path, value: Float[np.ndarray, "h w c"], size: tuple[int, ...], like: str = "the other maps"
+) -> None:
     """Looks at the size of a map.
 
     Raises:
-        UnirenderError: it is not that of the others, rows and columns.
+        UnirenderError: it is not that of what it has to be like, rows and columns.
     """
     if value.shape[:2] != size:
         rows, columns = value.shape[:2]
         raise UnirenderError(
-            f"{path}: is {columns} x {rows} pixels, expected {size[1]} x {size[0]} like the other maps; resample it"
+            f"{path}: is {columns} x {rows} pixels, expected {size[1]} x {size[0]} like {like}; resample it"
         )
 
 

@@ -52,7 +52,7 @@ def test_turned_normals_receive_other_light_and_keep_the_detail(maps: Intrinsics
         assert np.abs(wanted[turned] / before[turned] - 1).max() > 0.1  # the edit is none that the tolerance hides
 
 
-def test_a_painted_roughness_changes_s_as_an_edit_does(maps: Intrinsics) -> None:
+def test_a_painted_roughness_changes_s_as_an_edit_does(maps: Intrinsics, caplog: pytest.LogCaptureFixture) -> None:
     roughness = maps.require("roughness")["roughness"].copy()
     roughness[12:20, 12:20] = 0.2
     after = with_edited_light(maps, maps.replace(roughness=roughness))
@@ -60,6 +60,8 @@ def test_a_painted_roughness_changes_s_as_an_edit_does(maps: Intrinsics) -> None
     np.testing.assert_array_equal(after.require("specular")["specular"], expected)
     assert (after.require("specular")["specular"] != maps.specular).any()
     assert after.diffuse is maps.diffuse
+    covered = int((maps.require("mask")["mask"] > 0).sum())
+    assert f"too coarse to show what the edited roughness reflects on {100 * 64 / covered:.0f}% of" in caplog.text
 
 
 def test_what_was_painted_itself_or_cannot_follow_stays(maps: Intrinsics, caplog: pytest.LogCaptureFixture) -> None:

@@ -225,6 +225,10 @@ def _smaller(folder: Path) -> None:
     opened(folder / "albedo.png").resize((12, 12)).save(folder / "albedo.png")
 
 
+def _smaller_light(folder: Path) -> None:
+    opened(folder / "environment.png").resize((8, 4)).save(folder / "environment.png")
+
+
 def _smaller_alone(folder: Path) -> None:
     _remove_alone(folder)
     _smaller(folder)
@@ -262,7 +266,8 @@ def _odd_channels(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (_smaller, r"albedo.png: is 12 x 12 pixels, expected 24 x 24 like the other maps; resample it"),
+        (_smaller, r"albedo.png: is 12 x 12 pixels, expected 24 x 24 like intrinsics.exr; resample it"),
+        (_smaller_light, r"environment.png: is 8 x 4 pixels, expected 16 x 8 like environment.exr; resample it"),
         (_smaller_alone, r"albedo.png: is 12 x 12 pixels, expected 24 x 24 like the other maps; resample it"),
         (_packed, r"roughness.png is in colour: .* roughness is the green channel"),
         (_twice, r"albedo.png: is the map albedo, as albedo.jpg is; keep the one that counts"),
@@ -296,3 +301,7 @@ def test_pictures_of_other_names_and_what_a_picture_loses_are_told(
     assert "specular.png: is at display white on" in caplog.text
     assert "diffuse.png: is at" not in caplog.text
     assert set(RADIANCE_MAPS) <= set(read_result(folder).present)
+    assert "environment.png" not in caplog.text
+    (folder / "environment.exr").unlink()
+    assert read_result(folder).environment is None
+    assert "environment.png: not read: its values end at display white, expected environment.exr" in caplog.text

@@ -15,9 +15,10 @@ from jaxtyping import Bool
 
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines.derived_light import derived_light
-from unirender.pipelines.editing import LOBE_FLOOR, LOBE_RATIO, specular_for_roughness
+from unirender.pipelines.editing import LOBE_FLOOR, LOBE_RATIO, specular_for_roughness, too_coarse
 
 LIT = ("specular", "diffuse")
+MUCH_COARSE = 0.05  # share of the object, from which it is told
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +45,15 @@ def with_edited_light(stored: Intrinsics, edited: Intrinsics) -> Intrinsics:
         return edited
     light = {name: getattr(edited, name) for name in own}
     if "specular" in own and resurfaced.any():
-        light["specular"], _ = specular_for_roughness(stored, edited.require("roughness")["roughness"])
+        roughness = edited.require("roughness")["roughness"]
+        light["specular"], _ = specular_for_roughness(stored, roughness)
+        coarse = too_coarse(stored, roughness).sum() / max((stored.require("mask")["mask"] > 0).sum(), 1)
+        if coarse > MUCH_COARSE:
+            logger.warning(
+                "the light is too coarse to show what the edited roughness reflects on %.0f%% of the object: its "
+                "highlights stay as wide as they were",
+                100 * coarse,
+            )
     if turned.any():
         environment = stored.require("environment")["environment"]
         old, new = (
