@@ -101,6 +101,31 @@ def test_render_takes_what_decompose_wrote(ball: Path, decomposed: Path, tmp_pat
     assert json.loads((tmp_path / "out" / "meta.json").read_text())["fov_deg"] == 30
 
 
+def test_render_shows_what_was_painted_and_takes_pictures_alone(
+    decomposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """From the pictures alone the object is the same within what 8 bits and a clipped light leave."""
+    shutil.copytree(decomposed, tmp_path / "painted")
+    albedo = np.array(Image.open(decomposed / "albedo.png"))
+    albedo[40:60, 60:90] = [20, 200, 40]
+    Image.fromarray(albedo).save(tmp_path / "painted" / "albedo.png")
+    shutil.copytree(decomposed, tmp_path / "alone", ignore=shutil.ignore_patterns("*.exr"))
+    pictures = {}
+    for name, folder in {"as found": decomposed, **{n: tmp_path / n for n in ("painted", "alone")}}.items():
+        assert run("render", folder, "--output", tmp_path / f"{name} rendered", "--dtype", "float32") == 0
+        pictures[name] = np.array(Image.open(tmp_path / f"{name} rendered" / "image.png"), np.float32)[..., :3] / 255
+        edited = json.loads((tmp_path / f"{name} rendered" / "meta.json").read_text())["edited"]
+        assert edited == (["albedo"] if name == "painted" else [])
+    assert "edited in" in capsys.readouterr().err
+    inside = np.array(Image.open(decomposed / "mask.png"))[..., None] == 255
+    difference = {name: np.abs(picture - pictures["as found"]) * inside for name, picture in pictures.items()}
+    middle = pictures["painted"][45:55, 65:85].mean(axis=(0, 1))
+    assert middle.argmax() == 1
+    assert pictures["as found"][45:55, 65:85].mean(axis=(0, 1)).argmax() == 0
+    assert difference["painted"][:20].max() < 0.03  # away from it
+    assert difference["alone"].mean() / inside.mean() < 0.02
+
+
 def test_render_takes_one_file_and_the_camera_in_its_header(
     decomposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -210,7 +235,7 @@ def test_render_of_a_folder_without_maps_is_one_line(tmp_path: Path, capfd: pyte
     """What OpenEXR prints of a missing file by itself counts, too."""
     assert run("render", tmp_path, "--output", tmp_path / "out") == 1
     (line,) = capfd.readouterr().err.splitlines()
-    assert line.endswith("has no intrinsics.exr, expected the output folder of `unirender decompose`")
+    assert "has no intrinsics.exr and no maps like albedo.png, expected the output folder of" in line
 
 
 def test_render_says_where_normals_face_away(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -31,6 +31,7 @@ HALF_MAX = 65504.0
 HALF_FULL = 2.0**-10  # half precision has all its digits down to 2^-14: of radiance that ends below, too few are left
 ATTRIBUTE_PREFIX = "unirender:"
 CAMERA_ATTRIBUTE = "camera"  # as `unirender.camera.Camera.describe` has it
+LIGHT_ATTRIBUTE = "light_sha256"  # of maps: of the environment beside them, to which their s and d belong
 GRID_ATTRIBUTE, POLE_GRID = "grid", "poles"
 GAUGE_ATTRIBUTE = "exposure_factor"  # of ground truth: its environments are on the pole grid, too
 _COMPONENTS = {"normal": "XYZ", "albedo": "RGB", "specular": "RGB", "diffuse": "RGB"}  # the others: "Y"
@@ -168,6 +169,14 @@ def channel_names(path: Path) -> frozenset[str]:
         return frozenset(channel.name for channel in OpenEXR.File(str(path), header_only=True).header()["channels"])
     except Exception:  # several types, as in reading
         return frozenset()
+
+
+def states(path: Path, attribute: str) -> bool:
+    """Whether the header of a file has an attribute of ours; not where there is none that can be read."""
+    try:
+        return path.is_file() and ATTRIBUTE_PREFIX + attribute in OpenEXR.File(str(path), header_only=True).header()
+    except Exception:  # several types, as in reading
+        return False
 
 
 def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[str, str]]:

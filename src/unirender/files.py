@@ -1,7 +1,8 @@
 """Result folders on disk.
 
 A *result folder* holds `intrinsics.exr` (all image-aligned maps), `environment.exr` (float32), one PNG a map for the
-eye and `meta.json`; it appears complete or not at all. `read_result` takes it back, or one such EXR by itself: every
+eye and for image editors, and `meta.json`; it appears complete or not at all. `read_result` takes it back with what was
+edited in its PNGs, or a folder that has a file for each map (`unirender.map_files`), or one such EXR by itself: every
 EXR says in its header attributes `unirender:*` where it comes from and through which camera it is seen.
 """
 
@@ -25,6 +26,7 @@ from unirender.color import image_srgb, unpremultiply
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import (
     CAMERA_ATTRIBUTE,
+    LIGHT_ATTRIBUTE,
     channels_rgb,
     header_camera,
     image_channels,
@@ -37,6 +39,9 @@ from unirender.exr import (
     write_exr,
 )
 from unirender.intrinsics import IMAGE_MAPS, Intrinsics
+from unirender.map_edits import with_edits
+from unirender.map_files import map_files, read_maps, report_unread
+from unirender.picture_files.display_files import open_picture
 from unirender.system.paths import forget_half_made
 from unirender.system.whole_files import move_into_place, naming
 from unirender.visualization import map_picture as map_picture  # known by this name, too
@@ -46,8 +51,6 @@ INTRINSICS_FILE, ENVIRONMENT_FILE, IMAGE_FILE, META_FILE = "intrinsics.exr", "en
 SUMMARY_FILE = "summary.json"  # of a folder of results
 
 FILE_SUFFIXES = (".exr", ".glb", ".gltf", ".json", ".png", ".xml")
-
-LIGHT_ATTRIBUTE = "light_sha256"  # of maps: of the environment beside them, to which their s and d belong
 
 logger = logging.getLogger(__name__)
 
@@ -200,16 +203,20 @@ def header_attributes(meta: Mapping[str, Any], camera: Camera | None) -> dict[st
     return attributes if camera is None else attributes | {CAMERA_ATTRIBUTE: camera.describe()}
 
 
-def read_result(path: str | Path, fov_deg: float | None = None, *, light: bool = True) -> Intrinsics:
-    """The maps of a result folder, or those of one EXR file, which then come without the environment.
+def read_result(
+    path: str | Path, fov_deg: float | None = None, *, light: bool = True, edits: bool = True
+) -> Intrinsics:
+    """The maps of a folder, or those of one EXR file, which then come without the environment.
 
-    The camera is that of the folder's `meta.json`, else that of the EXR header, else the contract's default, which is
-    logged.
+    A result folder has them in `intrinsics.exr`; where a picture of a map beside it was edited, the picture counts
+    (`unirender.map_edits`). Without that file they are files named like the maps (`unirender.map_files`). The camera is
+    that of the folder's `meta.json`, else that of the EXR header, else the contract's default, which is logged.
 
     Args:
         path: the folder or the EXR file.
         fov_deg: instead of the field of view that is stored.
         light: whether the folder's environment is wanted; else it is not looked at.
+        edits: whether edited pictures count; else they are not looked at.
 
     Raises:
         UnirenderError: there is nothing of the kind, a file is broken, or the folder's environment is another one than
@@ -217,59 +224,87 @@ def read_result(path: str | Path, fov_deg: float | None = None, *, light: bool =
     """
     path = as_path(path)
     file = path / INTRINSICS_FILE if path.is_dir() else path
+    attributes: dict[str, str] = {}
     if path.is_dir() and not file.is_file():
-        inside = sorted(found.parent.name for found in path.glob(f"*/{INTRINSICS_FILE}"))
-        several = f": name one of the folders inside, like {path / inside[0]}" if inside else ""
+        maps = _single_maps(path)
+    elif not file.is_file() or file.suffix.lower() != ".exr":
         raise UnirenderError(
-            f"{path}: has no {INTRINSICS_FILE}, expected the output folder of `unirender decompose`{several}"
+            f"{path}: no folder and no EXR file, expected the output of `unirender decompose` or a folder with a file "
+            "for each map"
         )
-    if not file.is_file() or file.suffix.lower() != ".exr":
-        raise UnirenderError(f"{path}: no folder and no EXR file, expected the output of `unirender decompose`")
+    else:
+        maps, attributes = _maps_of_exr(file, path)
+    maps = maps.replace(camera=_camera(path, attributes, fov_deg))
+    if light and (path / ENVIRONMENT_FILE).is_file():
+        maps = _with_light(maps, path, attributes.get(LIGHT_ATTRIBUTE))
+    return with_edits(maps, path) if edits else maps
+
+
+def _maps_of_exr(file: Path, path: Path) -> tuple[Intrinsics, dict[str, str]]:
+    """The maps of an EXR file and its attributes; `path` is what messages name.
+
+    Raises:
+        UnirenderError: it is broken, or has no maps.
+    """
     channels, attributes = read_exr(file)
-    environment, camera = None, None
-    if path.is_dir():
-        camera = _camera_of_meta(path / META_FILE)
-        if light and (path / ENVIRONMENT_FILE).is_file():
-            environment = _read_environment(path / ENVIRONMENT_FILE)
     try:
-        if camera is None and CAMERA_ATTRIBUTE in attributes:
-            text = attributes[CAMERA_ATTRIBUTE]
-            camera = _camera_of_header(text) if fov_deg is None else header_camera(attributes)
-        if camera is None and fov_deg is None:
-            logger.warning(
-                "%s says nothing of its camera: a field of view of %g degrees is assumed (fov_deg, --fov)",
-                path,
-                DEFAULT_FOV_DEG,
-            )
-        camera = camera or Camera()
-        if fov_deg is not None:
-            camera = dataclasses.replace(camera, fov_deg=fov_deg)
-        intrinsics = intrinsics_from_channels(channels, environment, camera)
+        maps = intrinsics_from_channels(channels)
     except UnirenderError as error:
         raise UnirenderError(f"{path}: {error}") from error
-    stored = attributes.get(LIGHT_ATTRIBUTE)
-    if environment is not None and stored and _is_lit(intrinsics) and stored != _light_sha256(environment):
-        raise UnirenderError(
-            f"{path}: {ENVIRONMENT_FILE} is another light than that of the specular and diffuse beside it, which are "
-            "rendered as they are; put it back, and pass the other light as --environment (with --exposure 0 as bright "
-            "as it is), in Python read_result(path, light=False).replace(environment=other, specular=None, "
-            "diffuse=None): they are then derived from it"
-        )
-    if not intrinsics.present:
+    if not maps.present:
         raise UnirenderError(f"{path}: has the channels {', '.join(sorted(channels))}, expected maps like albedo.R")
-    return intrinsics
+    return maps, attributes
 
 
-def _camera_of_header(text: str) -> Camera:
+def _single_maps(folder: Path) -> Intrinsics:
+    """The maps of a folder that has a file for each.
+
+    Raises:
+        UnirenderError: it has none, or one is broken.
+    """
+    files = map_files(folder)
+    if not set(files) - {"mask"}:
+        inside = sorted(found.parent.name for found in folder.glob(f"*/{INTRINSICS_FILE}"))
+        several = f": name one of the folders inside, like {folder / inside[0]}" if inside else ""
+        raise UnirenderError(
+            f"{folder}: has no {INTRINSICS_FILE} and no maps like albedo.png, expected the output folder of "
+            f"`unirender decompose`{several}"
+        )
+    report_unread(folder)
+    if (picture := folder / "environment.png").is_file() and not (folder / ENVIRONMENT_FILE).is_file():
+        logger.warning("%s: not read: its values end at display white, expected %s", picture, ENVIRONMENT_FILE)
+    maps = read_maps(files)
+    try:
+        return Intrinsics().replace(**maps)
+    except UnirenderError as error:
+        raise UnirenderError(f"{folder}: {error}") from error
+
+
+def _camera(path: Path, attributes: Mapping[str, str], fov_deg: float | None) -> Camera:
+    """The camera of a folder or an EXR file; see `read_result`."""
+    camera = _camera_of_meta(path / META_FILE) if path.is_dir() else None
+    if camera is None and CAMERA_ATTRIBUTE in attributes:
+        camera = header_camera(attributes) if fov_deg is not None else _camera_of_header(path, attributes)
+    if camera is None and fov_deg is None:
+        logger.warning(
+            "%s says nothing of its camera: a field of view of %g degrees is assumed (fov_deg, --fov)",
+            path,
+            DEFAULT_FOV_DEG,
+        )
+    camera = camera or Camera()
+    return camera if fov_deg is None else dataclasses.replace(camera, fov_deg=fov_deg)
+
+
+def _camera_of_header(path: Path, attributes: Mapping[str, str]) -> Camera:
     """The camera that a header states.
 
     Raises:
         UnirenderError: it is none.
     """
     try:
-        return Camera.parse(text)
+        return Camera.parse(attributes[CAMERA_ATTRIBUTE])
     except UnirenderError as error:
-        raise UnirenderError(f"{error}; pass the field of view (fov_deg, --fov)") from error
+        raise UnirenderError(f"{path}: {error}; pass the field of view (fov_deg, --fov)") from error
 
 
 def _is_lit(intrinsics: Intrinsics) -> bool:
@@ -281,23 +316,48 @@ def _light_sha256(environment: Float[np.ndarray, "eh ew 3"]) -> str:
     return hashlib.sha256(repr(environment.shape).encode() + environment.tobytes()).hexdigest()
 
 
-def _read_environment(file: Path) -> Float[np.ndarray, "eh ew 3"]:
-    """The environment of a result folder.
+def _with_light(maps: Intrinsics, folder: Path, sha256: str | None) -> Intrinsics:
+    """The maps with the environment of their folder; without s and d where it was edited since they were written.
+
+    Args:
+        maps: of the folder.
+        folder: with an environment.
+        sha256: of the environment that s and d belong to, where the maps state it.
 
     Raises:
-        UnirenderError: it is broken, or a map from elsewhere, whose rows lie otherwise.
+        UnirenderError: it is broken, a map from elsewhere, whose rows lie otherwise, or one of ours that s and d do not
+            belong to.
     """
+    file = folder / ENVIRONMENT_FILE
     channels, attributes = read_exr(file)
-    if not on_pole_grid(attributes):
+    try:
+        environment = channels_rgb(channels)
+        lit = maps.replace(environment=environment)
+    except UnirenderError as error:
+        raise UnirenderError(f"{file}: {error}") from error
+    ours = on_pole_grid(attributes)
+    if not ours and not _is_size_of(folder / f"{file.stem}.png", environment):
         raise UnirenderError(
             f"{file}: is no environment that unirender wrote, and a lat-long map from elsewhere has to be resampled; "
             "take it out of the folder and pass it as --environment (with --exposure 0 as bright as it is), in Python "
             "load_light(path, normalise=False).environment of unirender_reference.lights"
         )
-    try:
-        return channels_rgb(channels)
-    except UnirenderError as error:
-        raise UnirenderError(f"{file}: {error}") from error
+    if not _is_lit(maps) or not sha256 or sha256 == _light_sha256(environment):
+        return lit
+    if ours:
+        raise UnirenderError(
+            f"{folder}: {ENVIRONMENT_FILE} is another light than that of the specular and diffuse beside it, which are "
+            "rendered as they are; put it back, and pass the other light as --environment (with --exposure 0 as bright "
+            "as it is), in Python read_result(path, light=False).replace(environment=other, specular=None, "
+            "diffuse=None): they are then derived from it"
+        )
+    logger.warning("%s: edited, so that specular and diffuse follow from it", file)
+    return lit.replace(specular=None, diffuse=None)
+
+
+def _is_size_of(picture: Path, environment: Float[np.ndarray, "eh ew 3"]) -> bool:
+    """Whether the picture of a light that we wrote has the size of a light that no longer says so, and was edited."""
+    return picture.is_file() and open_picture(picture).size == environment.shape[1::-1]
 
 
 def _camera_of_meta(path: Path) -> Camera | None:

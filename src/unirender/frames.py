@@ -35,7 +35,7 @@ class FilmFrame:
         Raises:
             UnirenderError: one of them is gone or broken.
         """
-        maps = read_result(result).maps
+        maps = read_result(result, edits=False).maps
         shown = {name: np.clip(map_picture(name, maps[name]), 0, 1) for name in MAPS if name in maps and name != "mask"}
         return cls({"input": read_picture(picture).image_srgb} | shown, maps["mask"])
 

@@ -20,6 +20,8 @@ from tiny_suites import make_suite
 
 from unirender.color import image_srgb, unpremultiply
 from unirender.exr import image_channels, write_exr
+from unirender.files import write_result
+from unirender.intrinsics import Intrinsics
 from unirender.models.dual_stream import DualStreamModel
 from unirender.training.data.groups import read_groups
 from unirender.visualization import write_png
@@ -62,10 +64,16 @@ def photograph() -> Names:
 def mug() -> Names:
     picture = photograph()
     write_png(Path("mug.png"), np.concatenate([picture["image_srgb"], picture["mask"]], axis=-1))
+    facing = picture["mask"] * np.array([0, 0, 1], np.float32)
+    even = {"roughness": 0.5 * picture["mask"], "metallic": 0 * picture["mask"], "mask": picture["mask"]}
+    Path("mug").mkdir()
+    write_result("mug", Intrinsics(albedo=0.5 * picture["image_srgb"], normal=facing, **even), {})
+    Image.new("RGB", picture["mask"].shape[1::-1], "red").save("mug/albedo.png")
     return {}
 
 
 def check_tour(names: Names) -> None:
+    np.testing.assert_array_equal(names["edited"].albedo, names["stored"].mask * np.array([1, 0, 0]))
     assert names["chrome"].coarse_share == 1.0, "the page says 1.0"
     assert names["again"].shape == (64, 64, 3)
 

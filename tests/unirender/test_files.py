@@ -403,7 +403,7 @@ def test_an_environment_from_elsewhere_is_not_taken_for_one_of_ours(tmp_path: Pa
     light = np.ones((8, 16, 3), dtype=np.float32)
     write_result(str(tmp_path), Intrinsics(mask=mask, roughness=mask, environment=light, camera=Camera()), {})
     assert read_result(tmp_path).environment is not None
-    write_exr(tmp_path / "environment.exr", image_channels(light))
+    write_exr(tmp_path / "environment.exr", image_channels(np.ones((9, 18, 3), dtype=np.float32)))
     with pytest.raises(UnirenderError, match=r"environment\.exr: is no environment that .*--environment"):
         read_result(tmp_path)
 

@@ -34,6 +34,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.exr import MAP_CHANNELS, channels_rgb, intrinsics_from_channels, read_exr
 from unirender.intrinsics import MAPS, Intrinsics
+from unirender.map_files import normals_of_picture
 from unirender_evaluation.methods.method import Image, Mask
 from unirender_evaluation.methods.plausible import picture_doubt
 from unirender_evaluation.predictions.conventions import FILE, Conventions, read_conventions
@@ -47,8 +48,6 @@ LIGHT_FILES = (f"{LIGHT_ANSWER}.exr", f"{LIGHT_ANSWER}.hdr")
 SUFFIXES = (".exr", ".png")
 READ = tuple(channel for channels in MAP_CHANNELS.values() for channel in channels)
 HARMLESS = ("R", "G", "B", "A", "depth.Z")  # a picture beside the maps; depth, which public sets ask for
-NO_NORMAL = (0.01, 1.5)  # lengths: 0 in 8 bits has up to 0.007, and black and white, behind an object, have 1.7
-LONGEST = 1.1  # median length of the normals of a PNG: of sRGB-encoded ones it is about 1.2
 BRIGHTEST = 1e30  # divided by an edge's coverage, much brighter values are no float32 any more
 
 
@@ -217,11 +216,7 @@ class PredictionFolder:
         value = self._read_png(path, MAPS[name], name)
         _check_size(path, name, value, mask)
         if name == "normal":
-            value = 2 * value - 1
-            length = np.linalg.norm(value, axis=-1, keepdims=True)
-            there = (length > NO_NORMAL[0]) & (length < NO_NORMAL[1]) & (mask > 0)
-            _check_lengths(length[there])
-            value = np.divide(value, length, out=np.zeros_like(value), where=there)
+            value = normals_of_picture(value, mask)
         elif name in COLOURS:
             value = self.conventions.linear(value, ".png")
         return self._converted({name: value})
@@ -245,14 +240,6 @@ def _named(path: Path) -> Iterator[None]:
         yield
     except UnirenderError as error:
         raise UnirenderError(str(error) if str(path) in str(error) else f"predictions: {path}: {error}") from None
-
-
-def _check_lengths(lengths: Float[np.ndarray, " n"]) -> None:
-    if lengths.size and (median := float(np.median(lengths))) > LONGEST:
-        raise UnirenderError(
-            f"its normals have a length of {median:.2f} (median), expected 1: write (n + 1) / 2 of unit normals, "
-            "without encoding it to sRGB"
-        )
 
 
 def _check_brightness(what: str, value: Float[np.ndarray, "h w c"]) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
+from unirender.map_files import one_channel
 from unirender.picture_files.cicp import read_cicp
 from unirender.picture_files.icc import states_other_colors
 from unirender.picture_files.sixteen_bits import sixteen_bit_values
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from PIL import Image
 
 LINEAR_GAMMA = 0.9  # of the gAMA chunk: 1 is linear, 0.45 like sRGB
-COLOURED = 0.1  # mean difference of the channels; a network's grey pictures have a hundredth
 
 
 def read_png(path: Path, channels: int, encoded: bool = False) -> Float[np.ndarray, "h w c"]:
@@ -55,13 +55,7 @@ def read_png(path: Path, channels: int, encoded: bool = False) -> Float[np.ndarr
     value = value if value.ndim == 3 else value[..., None]
     if channels == 3:
         return np.repeat(value, 3, axis=-1) if value.shape[-1] == 1 else value.astype(np.float32)
-    if (difference := float(np.ptp(value, axis=-1).mean())) > COLOURED:
-        raise UnirenderError(
-            f"predictions: {path} is in colour: its channels differ by {difference:.2g} in the mean, expected one "
-            "value a pixel; write it as grey: of glTF's metallicRoughness, roughness is the green channel and metallic "
-            "the blue; of a network's three channels that should be one, their mean"
-        )
-    return value.mean(axis=-1, keepdims=True, dtype=np.float64).astype(np.float32)
+    return one_channel(value, f"predictions: {path}")
 
 
 def is_transparent(path: Path) -> bool:

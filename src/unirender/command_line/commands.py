@@ -109,8 +109,8 @@ class Render:
     """Rendering: maps (as `decompose` writes them) -> picture."""
 
     maps: Annotated[Path, tyro.conf.Positional]
-    """Output of `unirender decompose`; any folder with `intrinsics.exr` and, for light, `environment.exr`; or one EXR
-    file of maps."""
+    """Output of `unirender decompose`, whose PNGs may have been edited; any folder with `intrinsics.exr` or with a file
+    for each map (`albedo.png`, `normal.exr`, ...) and, for light, `environment.exr`; or one EXR file of maps."""
     out: tyro.conf.OmitArgPrefixes[OutputOptions]
     environment: Path | None = None
     """Lat-long HDR or EXR light, or a photograph, instead of the folder's; s and d are derived from it."""
@@ -124,6 +124,8 @@ class Render:
     def run(self, read_light: ReadLight) -> int:
         """Returns the exit status."""
         from unirender.files import new_folder, read_result, write_result
+        from unirender.map_edits import with_edits
+        from unirender.pipelines.edited_light import with_edited_light
         from unirender.pipelines.editing import under_light
         from unirender.pipelines.inputs import RENDER_NEEDS, ready_to_render, to_derive, told_derived, with_mask
 
@@ -132,13 +134,17 @@ class Render:
         if self.exposure is not None and self.environment is None:
             raise UsageError(f"--exposure {self.exposure:g} is of a new light: expected --environment beside it")
         remarks = self._memory_remarks()
-        intrinsics = read_result(self.maps, self.model.fov, light=self.environment is None)
+        stored = read_result(self.maps, self.model.fov, light=self.environment is None, edits=False)
+        intrinsics = with_edits(stored, self.maps)
+        if self.environment is None:
+            intrinsics = with_edited_light(stored, intrinsics)
         intrinsics.require(*RENDER_NEEDS)
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light = None if self.environment is None else exposed_light(read_light, self.environment, self.exposure)
             pipeline = self.model.load()
             meta: dict[str, Any] = {"command": "render", "input": self.maps}
-            meta |= missing_maps(intrinsics, self.environment is not None)
+            changed = [name for name, value in intrinsics.maps.items() if value is not getattr(stored, name)]
+            meta |= {"edited": changed, **missing_maps(intrinsics, self.environment is not None)}
             intrinsics = with_mask(intrinsics)
             meta |= normals_away(intrinsics)
             if light is not None:
@@ -162,8 +168,13 @@ class Render:
         """As `memory_remarks` has them, of the maps' size in their header."""
         from unirender.exr import channel_names, pixel_count
         from unirender.files import ENVIRONMENT_FILE, INTRINSICS_FILE
+        from unirender.map_files import map_files
+        from unirender.pictures import header_pixels
 
         file = self.maps / INTRINSICS_FILE if self.maps.is_dir() else self.maps
+        if self.maps.is_dir() and not file.is_file() and (files := map_files(self.maps)):
+            size = max(map(header_pixels, files.values()))
+            return memory_remarks(self.maps, size, DERIVED_BYTES_A_PIXEL)
         if not file.is_file():  # told by what reads the maps; OpenEXR would print a line of its own
             return {}
         lit = self.maps.is_dir() and (self.maps / ENVIRONMENT_FILE).exists()

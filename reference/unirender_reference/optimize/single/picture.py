@@ -104,7 +104,7 @@ def _camera(stated: Camera | None, fov_deg: float | None, normal: Path | None) -
         _log.warning("field of view of %g degrees, as the picture's header says (--fov)", stated.fov_deg)
         return stated
     if normal is not None and _has_maps(normal):
-        camera = read_result(normal, light=False).camera
+        camera = read_result(normal, light=False, edits=False).camera
         _log.warning("field of view of %g degrees, the one that %s is read with (--fov)", camera.fov_deg, normal)
         return camera
     _log.warning("field of view not given: %g degrees assumed (--fov)", DEFAULT_FOV_DEG)
