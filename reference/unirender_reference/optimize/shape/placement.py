@@ -4,6 +4,7 @@ A mesh has to cover the pictures as their masks do (`coverage`); where it does n
 """
 
 import dataclasses
+import logging
 from collections.abc import Sequence
 
 import numpy as np
@@ -23,6 +24,8 @@ FULL = 0.9  # of a frame: a mesh that covers as much may have a mask that covers
 SHOWN = 3  # names in a message
 EDGES = (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1])
 UNIT_SPHERE = Sphere(np.zeros(3), 1.0)
+
+_log = logging.getLogger("unirender.optimize")
 
 
 def placed(views: Views, sphere: Sphere) -> Views:
@@ -102,7 +105,7 @@ def _names(names: Sequence[str]) -> str:
 
 
 def check_alignment(views: Views, obj: MeshObject, place: Sphere = UNIT_SPHERE, up: Up = "y") -> None:
-    """Looks whether a mesh lies where the masks are.
+    """Looks whether a mesh lies where the masks are; single views in which it does not are logged.
 
     Args:
         views: in the unit sphere of the mesh.
@@ -120,6 +123,7 @@ def check_alignment(views: Views, obj: MeshObject, place: Sphere = UNIT_SPHERE, 
         raise _no_outline(full)
     iou, least = mask_iou(views.seen, coverage), least_iou(views.seen)
     if iou >= least:
+        _warn_of_single(views.seen, coverage)
         return
     try:
         shown = sphere_of_masks(views)
@@ -130,6 +134,21 @@ def check_alignment(views: Views, obj: MeshObject, place: Sphere = UNIT_SPHERE, 
         f"mesh {obj.name}: it covers other pixels than the masks of the pictures: IoU (intersection over union) "
         f"{iou:.2f}, expected at least {least:.2f}; {hint}"
     )
+
+
+def _warn_of_single(views: Sequence[View], coverage: Float[np.ndarray, "k h w"]) -> None:
+    """Logs the views whose own IoU is too small, which those of many others hide."""
+    found = [(view, mask_iou([view], own[None])) for view, own in zip(views, coverage, strict=True) if view.mask.any()]
+    wrong = {view.name: iou for view, iou in found if iou < least_iou([view])}
+    if wrong:
+        _log.warning(
+            "the mesh covers other pixels than the mask in %d of %d pictures (%s): IoU down to %.2f; are their poses "
+            "or masks wrong? leave them out",
+            len(wrong),
+            len(views),
+            _names(list(wrong)),
+            min(wrong.values()),
+        )
 
 
 def check_in_picture(mask: Float[np.ndarray, "h w 1"], camera: Camera, obj: MeshObject) -> None:
