@@ -14,7 +14,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_reference.multiview import pose_towards
 from unirender_reference.optimize.files.transforms import Up
-from unirender_reference.optimize.shape.coverage import coverage_of, least_iou, mask_iou
+from unirender_reference.optimize.shape.coverage import coverage_of, covered_otherwise, least_iou, mask_iou
 from unirender_reference.optimize.shape.misplaced import OPENCV, likely_cause
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.shapes import MeshObject, Sphere
@@ -70,8 +70,8 @@ def sphere_of_masks(views: Views) -> Sphere:
     away = [view.name for (view, _), axis in zip(rays, axes, strict=True) if (center - view.pose[:3, 3]) @ axis <= 0]
     if away:
         raise UnirenderError(
-            f"views: the object that the masks show lies behind {len(away)} of {len(rays)} cameras ({_names(away)}); "
-            f"expected it before all of them: {OPENCV}"
+            f"views: the object that the masks show lies behind {len(away)} of {len(rays)} cameras "
+            f"({short_list(away)}); expected it before all of them: {OPENCV}"
         )
     reach = max(
         float(np.linalg.norm(np.cross(covered, center - view.pose[:3, 3]), axis=1).max()) for view, covered in rays
@@ -87,7 +87,7 @@ def _check_whole(views: Views) -> None:
     cut = [view.name for view in views.seen if any((view.mask[edge] > 0.5).any() for edge in EDGES)]
     if cut:
         raise UnirenderError(
-            f"views: the frame cuts the object off in {len(cut)} of {len(views.seen)} pictures ({_names(cut)}); "
+            f"views: the frame cuts the object off in {len(cut)} of {len(views.seen)} pictures ({short_list(cut)}); "
             "without a mesh, expected masks that do not touch the border: leave these pictures out, or pass the mesh "
             "(--mesh)"
         )
@@ -95,12 +95,13 @@ def _check_whole(views: Views) -> None:
 
 def _no_outline(names: Sequence[str]) -> UnirenderError:
     return UnirenderError(
-        f"views: the mask covers the whole frame in {len(names)} pictures ({_names(names)}), expected the object's "
+        f"views: the mask covers the whole frame in {len(names)} pictures ({short_list(names)}), expected the object's "
         "outline; is the alpha channel no mask (an opaque RGBA file)? name masks by mask_path"
     )
 
 
-def _names(names: Sequence[str]) -> str:
+def short_list(names: Sequence[str]) -> str:
+    """The first names, for a message."""
     return ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
 
 
@@ -138,16 +139,14 @@ def check_alignment(views: Views, obj: MeshObject, place: Sphere = UNIT_SPHERE, 
 
 def _warn_of_single(views: Sequence[View], coverage: Float[np.ndarray, "k h w"]) -> None:
     """Logs the views whose own IoU is too small, which those of many others hide."""
-    found = [(view, mask_iou([view], own[None])) for view, own in zip(views, coverage, strict=True) if view.mask.any()]
-    wrong = {view.name: iou for view, iou in found if iou < least_iou([view])}
-    if wrong:
+    if wrong := covered_otherwise(views, coverage):
         _log.warning(
             "the mesh covers other pixels than the mask in %d of %d pictures (%s): IoU down to %.2f; are their poses "
             "or masks wrong? leave them out",
             len(wrong),
             len(views),
-            _names(list(wrong)),
-            min(wrong.values()),
+            short_list([name for name, _ in wrong]),
+            min(iou for _, iou in wrong),
         )
 
 
