@@ -14,11 +14,11 @@ from posed_views import textured_object
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender_reference.arrays import ALIGNMENT, aligned, components
-from unirender_reference.backend import mitsuba, renderer_threads
+from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.shading import shade_points
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.optimize.surface.points import mapped_points
+from unirender_reference.optimize.surface.points import blocker, mapped_points, picture_points
 from unirender_reference.optimize.transport.light_grid import LightGrid
 from unirender_reference.optimize.transport.matrices import light_transport
 from unirender_reference.render import Renderer
@@ -100,10 +100,11 @@ def test_objects_run_the_same_kernels_wherever_their_texture_coordinates_lie() -
     assert traced(off_by(obj.uv, 0)) == traced(off_by(obj.uv, 16))
 
 
-@pytest.mark.parametrize("work", ["shade", "shade_gradients", "trace_visible", "shade_points"])
+@pytest.mark.parametrize("work", ["shade", "shade_gradients", "trace_visible", "shade_points", "picture_points"])
 def test_other_numbers_of_pixels_run_the_same_kernels(work: str) -> None:
     light, image, ball = scenes.environment(), np.ones((SIZE, SIZE, 3), np.float32), scenes.sphere(subdivisions=2)
     renderer, cameras = Renderer(ball, resolution=SIZE), Cameras(blank_views(1, SIZE))
+    scene = blocker(ball)
 
     def run(maps: Intrinsics) -> None:
         inside = maps.require("mask")["mask"][..., 0] > 0
@@ -116,6 +117,8 @@ def test_other_numbers_of_pixels_run_the_same_kernels(work: str) -> None:
                 trace_visible(renderer, inside, 0)
             case "shade_points":
                 shade_points(Solution(textured_object(0), light), cameras, np.flatnonzero(inside), 1, 0)
+            case "picture_points":
+                picture_points(scene, maps.require("mask")["mask"], Camera(), (SIZE, SIZE), 4)
 
     small, large = disc(0.3), disc(0.4)
     assert kernels(lambda: run(small)) == kernels(lambda: run(large))
@@ -129,5 +132,9 @@ def test_other_numbers_of_points_run_the_same_kernels_of_the_lights_matrices() -
         points = mapped_points(maps["mask"], maps["normal"], view)
         return kernels(lambda: light_transport(None, points, LightGrid(4, 8), 0))
 
-    with renderer_threads(1):  # several sum in copies of their own, with their size in the kernel
-        assert run(0.3) == run(0.4)
+    assert run(0.3) == run(0.4)
+
+
+def test_the_rays_of_a_picture_are_traced_by_one_kernel() -> None:
+    scene, mask = blocker(scenes.sphere(subdivisions=2)), disc(0.4).require("mask")["mask"]
+    assert len(kernels(lambda: picture_points(scene, mask, Camera(), (SIZE, SIZE), 4))) == 1

@@ -261,9 +261,11 @@ def test_stl_of_words_in_capitals_or_with_zeros(tmp_path, padding):
     assert len(load_mesh(tmp_path / "a.stl").faces) == 12
 
 
-@pytest.mark.parametrize("broken", [r"(?<=outer loop)\n", r"\n(?=vertex)", r"(?<=0)\n(?=outer)", r"(?<=endfacet)\n"])
+@pytest.mark.parametrize(
+    "broken", [r"(?<=outer loop)\n", r"\n(?=vertex)", r"\n(?=endloop)", r"(?<=0)\n(?=outer)", r"(?<=endfacet)\n", r"\n"]
+)
 def test_stl_of_words_whose_lines_end_elsewhere(tmp_path, broken):
-    """Only numbers are told apart by the ends of lines; a solid may be named by any words."""
+    """Everything may stand in one line; a solid may be named by any words."""
     text = re.sub(" *\n *", "\n", str(trimesh.creation.box().export(file_type="stl_ascii"))).strip() + "\n"
     text = re.sub("^(end)?solid.*", r"\1solid facet of a vertex", text, flags=re.MULTILINE)
     named = re.sub(broken, " ", text)

@@ -509,12 +509,15 @@ def test_find_meshes(tmp_path):
     assert names(tmp_path / "b.glb") == ["b.glb"]
     (tmp_path / "others").mkdir()
     (tmp_path / "others/chair.FBX").touch()
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked/models").symlink_to(tmp_path / "x")
     for pattern, message in {
         f"{tmp_path}/absent": "no such file or folder",
         f"{tmp_path}/absent/*.glb": "no folder .*absent; expected one before the first wildcard",
         f"{tmp_path}/*.fbx": r"no mesh found; expected files ending in [a-z., ]+$",  # not below it, as the pattern
         f"{tmp_path}/others": r"; chair\.FBX is there: export it as GLB, from Blender or with assimp$",
         f"{tmp_path}/others/chair.*": r"; chair\.FBX is there: export it as GLB",
+        f"{tmp_path}/linked": r"; models is a link to a folder, which is not entered: name the folder itself$",
         f"{tmp_path}/notes.txt": "no mesh found",
         f"{tmp_path}/.obj": "no mesh found",
     }.items():

@@ -64,6 +64,8 @@ def find_meshes(pattern: str | Path, unreadable: Callable[[Path, str], None] | N
     if empty:
         other = _other(Path(text))
         there = "" if other is None else f"; {other.name} is there: {OTHERS[other.suffix.lower()]}"
+        if link := _link(Path(text)):
+            there += f"; {link.name} is a link to a folder, which is not entered: name the folder itself"
         raise UnirenderError(f"meshes {pattern}: no mesh found; expected files ending in {', '.join(SUFFIXES)}{there}")
 
 
@@ -76,6 +78,12 @@ def _other(path: Path) -> Path | None:
         _, _, names = next(os.walk(path.parent), ("", [], []))
         files = [path.parent / name for name in sorted(names)]
     return next((file for file in files if file.suffix.lower() in OTHERS), None)
+
+
+def _link(path: Path) -> Path | None:
+    """A link to a folder in a folder; None where there is none."""
+    inner = sorted(path.iterdir()) if path.is_dir() else []
+    return next((entry for entry in inner if entry.is_symlink() and entry.is_dir()), None)
 
 
 def _glob(pattern: Path, report: Callable[[Path, str], None]) -> Iterator[Path]:

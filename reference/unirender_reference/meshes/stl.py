@@ -17,12 +17,12 @@ FACETS = np.dtype([("normal", "<f4", 3), ("points", "<f4", (3, 3)), ("attributes
 ATTRIBUTES = "attributes of facets"  # among what is ignored; where some exporters keep a colour
 MORE = "facets beyond the count"  # likewise
 END = 65536  # bytes in which the last solid ends; zeros may follow
-NAMES = re.compile(rb"solid(?!\S)[^\r\n]*")  # of solids: any words
+NAMES = re.compile(rb"solid(?!\S)[^\r\n]*?(?=[ \t]facet[ \t]+normal[ \t]+[-+.\d]|[\r\n]|$)")  # of solids: any words
 # The keywords, wherever they stand in a line; what is looked for behind their letters is found fast.
 MARKS = re.compile(rb"facet(?<!\Sfacet)(?!\S)|vertex(?<!\Svertex)(?!\S)")
 POINT = re.compile(rb"vertex(?<!\Svertex)((?:[ \t]+\S+){3})")
 NO_POINT = re.compile(
-    rb"vertex(?<!\Svertex)(?!(?:[ \t]+(?!vertex)\S+){3}[ \t\r]*(?:$|vertex(?!\S)))[^\r\n]*", re.MULTILINE
+    rb"vertex(?<!\Svertex)(?!(?:[ \t]+(?!vertex)\S+){3}[ \t\r]*(?:$|(?:vertex|endloop)(?!\S)))[^\r\n]*", re.MULTILINE
 )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
-from posed_views import painted_view, painted_views
+from posed_views import painted_view, painted_views, textured_object
 
 from unirender.camera import Camera
 from unirender.color import srgb_decode
@@ -24,7 +24,7 @@ from unirender_reference.optimize.multiview.run import optimize
 from unirender_reference.optimize.reduction import reduced
 from unirender_reference.optimize.refine.losses import ImageLoss
 from unirender_reference.optimize.shape.placement import placed
-from unirender_reference.optimize.transport.config import TransportConfig
+from unirender_reference.optimize.transport.config import MATRIX_BYTES, TransportConfig
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.shapes import Sphere
 
@@ -479,3 +479,18 @@ def test_more_pictures_than_fit_are_refused_before_they_are_read_or_worked_on(
         monkeypatch.setattr("unirender.system.machine.memory_bytes", lambda most=bytes_of_pixel * count * pixels: most)
         with pytest.raises(UnirenderError, match=rf"^{count} pictures of .* pixels: would take .*--most-views, --size"):
             does()
+
+
+def test_more_transport_than_fits_is_refused_before_the_work(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    """By the pixels that are asked for, or by all that are covered."""
+    views = read_views(folder)
+    covered = sum(int((view.mask > 0).sum()) for view in views.seen)
+    small = OptimizeConfig(texture_size=4, light_rows=8)
+    for pixels, taken in ((covered // 2, covered // 2), (10 * covered, covered)):
+        config = dataclasses.replace(small, transport=TransportConfig(pixels=pixels))
+        needed = MATRIX_BYTES * taken * 2 * 8**2
+        monkeypatch.setattr("unirender.system.machine.memory_bytes", lambda needed=needed: needed)
+        config.require_memory(covered)  # the twin
+        monkeypatch.setattr("unirender.system.machine.memory_bytes", lambda needed=needed: needed - 1)
+        with pytest.raises(UnirenderError, match=rf"^--transport.pixels {pixels}, --light-rows 8: would take about"):
+            optimize(views, textured_object(), config)

@@ -104,6 +104,20 @@ def test_a_mesh_that_lies_elsewhere_is_refused(views: Views, solution: Solution)
             check_alignment(placed(views, place), solution.obj)
 
 
+def test_a_single_pose_that_is_wrong_is_named(caplog: pytest.LogCaptureFixture):
+    """The others hide it in the IoU of all; a mask that shows nothing, or is wrong by half a pixel, is not named."""
+    views, mesh = pictures(64, 3), truth(3).obj
+    faint = dataclasses.replace(views.seen[0], mask=np.zeros_like(views.seen[0].mask))
+    rounded = dataclasses.replace(views.seen[1], mask=np.round(views.seen[1].mask))
+    check_alignment(Views((faint, rounded, *views.seen, *views.seen)), mesh)
+    assert not caplog.messages
+    turned_off = dataclasses.replace(views.seen[3], pose=views.seen[5].pose)
+    check_alignment(Views((turned_off, *views.seen, *views.seen[1:])), mesh)
+    assert [message.split(":")[0] for message in caplog.messages] == [
+        f"the mesh covers other pixels than the mask in 1 of 12 pictures ({turned_off.name})"
+    ]
+
+
 @pytest.mark.parametrize("side", [24, pytest.param(64, marks=pytest.mark.long)])
 def test_a_mesh_in_other_axes_is_refused(side: int):
     """Turned by quarters about each axis, at any size (an object that is nearly round about an axis is not)."""

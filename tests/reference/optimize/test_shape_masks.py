@@ -265,6 +265,17 @@ def test_reconstruction_of_a_torus_from_masks() -> None:
     assert stopped == [1]
 
 
+def test_masks_that_contradict_each_other_a_little_are_told_of(caplog: pytest.LogCaptureFixture) -> None:
+    """A pose that belongs to another picture carves away what the others show."""
+    views, config = mask_views(_torus(), 8, SIZE), ShapeConfig(cells=24, mask_steps=2)
+    reconstruct(views, config)
+    assert not caplog.messages  # twin
+    wrong = dataclasses.replace(views.seen[2], pose=views.seen[0].pose)
+    reconstruct(Views((*views.seen[:2], wrong, *views.seen[3:])), config)
+    assert len(caplog.messages) == 1
+    assert "the masks contradict each other: what lies inside all of them is not what" in caplog.messages[0]
+
+
 def test_vertex_normals_of_a_sphere_point_outwards() -> None:
     ball = sphere(subdivisions=4)
     assert (np.einsum("ni,ni->n", vertex_normals(ball.vertices, ball.faces), ball.vertices) > 0.9999).all()

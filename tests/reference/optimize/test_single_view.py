@@ -17,7 +17,6 @@ from unirender.system import machine
 from unirender_reference.optimize.single.config import (
     COLD,
     COLD_MESH,
-    MATRIX_BYTES,
     WARM_NORMALS,
     Priors,
     SingleConfig,
@@ -27,6 +26,7 @@ from unirender_reference.optimize.single.config import (
 from unirender_reference.optimize.single.fit import Fit, Unknowns
 from unirender_reference.optimize.single.pixels import make_picture
 from unirender_reference.optimize.single.run import optimize_image
+from unirender_reference.optimize.transport.config import MATRIX_BYTES
 from unirender_reference.optimize.views import Step
 from unirender_reference.render import Renderer
 from unirender_reference.shade import shade

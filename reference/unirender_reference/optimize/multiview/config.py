@@ -6,7 +6,7 @@ from unirender.errors import UsageError
 from unirender_reference.optimize.machine import require_memory
 from unirender_reference.optimize.refine.config import RefineConfig
 from unirender_reference.optimize.shape.config import ShapeConfig
-from unirender_reference.optimize.transport.config import TransportConfig
+from unirender_reference.optimize.transport.config import MATRIX_BYTES, TransportConfig
 from unirender_reference.option_checks import require_least
 
 # Bytes of memory, measured with textures of 512 and 1024 texels, lights of 16 to 48 rows, and 3 and 7 pictures of 512 x
@@ -61,3 +61,16 @@ class OptimizeConfig:
                 * (PAIR_BYTES * columns if self.transport.enabled else TEXEL_BYTES),
             }
         )
+
+    def require_memory(self, covered: int) -> None:
+        """Looks at what the transport stage takes.
+
+        Args:
+            covered: pixels of all pictures that are fitted.
+
+        Raises:
+            UnirenderError: it is more than the machine has in all.
+        """
+        entries = min(self.transport.pixels, covered) * 2.0 * self.light_rows**2
+        named = f"--transport.pixels {self.transport.pixels}, --light-rows {self.light_rows}"
+        require_memory({named: MATRIX_BYTES * entries}, "smaller numbers")

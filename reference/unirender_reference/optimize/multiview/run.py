@@ -68,7 +68,7 @@ def optimize(
 
     Raises:
         UnirenderError: the folder holds another run, all pictures are black, the masks do not bound an object that has
-            no mesh, the pictures take more memory than the machine has, or what a stage says.
+            no mesh, the pictures or the transport stage take more memory than the machine has, or what a stage says.
     """
     out = None if out is None else as_path(out, "out")
     as_instance(views, Views, "optimize: views")
@@ -82,6 +82,8 @@ def optimize(
     views.require_light()
     count = len(views.seen) + len(views.held_out)
     require_memory_for_pictures(count, views.height, views.width, PIXEL_BYTES)
+    if init is None and config.transport.enabled:
+        config.require_memory(sum(int((view.mask > 0).sum()) for view in views.seen))
     if obj is None and init is None:
         from unirender_reference.optimize.shape.bounds import check_masks
 

@@ -50,6 +50,12 @@ def least_iou(views: Sequence[View]) -> float:
     return max(FLOOR_IOU, LEAST_IOU - OUTLINE_ERROR * outline / max(float(masks.sum(dtype=np.float64)), 1e-9))
 
 
+def covered_otherwise(views: Sequence[View], coverage: Float[np.ndarray, "k h w"]) -> list[tuple[str, float]]:
+    """Name and IoU of the views in which a mesh is not what their mask shows; a mask of nothing says nothing."""
+    each = [(view, mask_iou([view], own[None])) for view, own in zip(views, coverage, strict=True) if view.mask.any()]
+    return [(view.name, iou) for view, iou in each if iou < least_iou([view])]
+
+
 def masks_of(views: Sequence[View]) -> Float[np.ndarray, "k h w"]:
     """The coverage that the views show."""
     return np.stack([view.mask[..., 0] for view in views]).astype(np.float64)

@@ -4,6 +4,7 @@ A mesh has to cover the pictures as their masks do (`coverage`); where it does n
 """
 
 import dataclasses
+import logging
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,7 +14,7 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_reference.multiview import pose_towards
 from unirender_reference.optimize.files.transforms import Up
-from unirender_reference.optimize.shape.coverage import coverage_of, least_iou, mask_iou
+from unirender_reference.optimize.shape.coverage import coverage_of, covered_otherwise, least_iou, mask_iou
 from unirender_reference.optimize.shape.misplaced import OPENCV, likely_cause
 from unirender_reference.optimize.views import View, Views
 from unirender_reference.shapes import MeshObject, Sphere
@@ -23,6 +24,8 @@ FULL = 0.9  # of a frame: a mesh that covers as much may have a mask that covers
 SHOWN = 3  # names in a message
 EDGES = (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1])
 UNIT_SPHERE = Sphere(np.zeros(3), 1.0)
+
+_log = logging.getLogger("unirender.optimize")
 
 
 def placed(views: Views, sphere: Sphere) -> Views:
@@ -67,8 +70,8 @@ def sphere_of_masks(views: Views) -> Sphere:
     away = [view.name for (view, _), axis in zip(rays, axes, strict=True) if (center - view.pose[:3, 3]) @ axis <= 0]
     if away:
         raise UnirenderError(
-            f"views: the object that the masks show lies behind {len(away)} of {len(rays)} cameras ({_names(away)}); "
-            f"expected it before all of them: {OPENCV}"
+            f"views: the object that the masks show lies behind {len(away)} of {len(rays)} cameras "
+            f"({short_list(away)}); expected it before all of them: {OPENCV}"
         )
     reach = max(
         float(np.linalg.norm(np.cross(covered, center - view.pose[:3, 3]), axis=1).max()) for view, covered in rays
@@ -84,7 +87,7 @@ def _check_whole(views: Views) -> None:
     cut = [view.name for view in views.seen if any((view.mask[edge] > 0.5).any() for edge in EDGES)]
     if cut:
         raise UnirenderError(
-            f"views: the frame cuts the object off in {len(cut)} of {len(views.seen)} pictures ({_names(cut)}); "
+            f"views: the frame cuts the object off in {len(cut)} of {len(views.seen)} pictures ({short_list(cut)}); "
             "without a mesh, expected masks that do not touch the border: leave these pictures out, or pass the mesh "
             "(--mesh)"
         )
@@ -92,17 +95,18 @@ def _check_whole(views: Views) -> None:
 
 def _no_outline(names: Sequence[str]) -> UnirenderError:
     return UnirenderError(
-        f"views: the mask covers the whole frame in {len(names)} pictures ({_names(names)}), expected the object's "
+        f"views: the mask covers the whole frame in {len(names)} pictures ({short_list(names)}), expected the object's "
         "outline; is the alpha channel no mask (an opaque RGBA file)? name masks by mask_path"
     )
 
 
-def _names(names: Sequence[str]) -> str:
+def short_list(names: Sequence[str]) -> str:
+    """The first names, for a message."""
     return ", ".join(names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
 
 
 def check_alignment(views: Views, obj: MeshObject, place: Sphere = UNIT_SPHERE, up: Up = "y") -> None:
-    """Looks whether a mesh lies where the masks are.
+    """Looks whether a mesh lies where the masks are; single views in which it does not are logged.
 
     Args:
         views: in the unit sphere of the mesh.
@@ -120,6 +124,7 @@ def check_alignment(views: Views, obj: MeshObject, place: Sphere = UNIT_SPHERE, 
         raise _no_outline(full)
     iou, least = mask_iou(views.seen, coverage), least_iou(views.seen)
     if iou >= least:
+        _warn_of_single(views.seen, coverage)
         return
     try:
         shown = sphere_of_masks(views)
@@ -130,6 +135,19 @@ def check_alignment(views: Views, obj: MeshObject, place: Sphere = UNIT_SPHERE, 
         f"mesh {obj.name}: it covers other pixels than the masks of the pictures: IoU (intersection over union) "
         f"{iou:.2f}, expected at least {least:.2f}; {hint}"
     )
+
+
+def _warn_of_single(views: Sequence[View], coverage: Float[np.ndarray, "k h w"]) -> None:
+    """Logs the views whose own IoU is too small, which those of many others hide."""
+    if wrong := covered_otherwise(views, coverage):
+        _log.warning(
+            "the mesh covers other pixels than the mask in %d of %d pictures (%s): IoU down to %.2f; are their poses "
+            "or masks wrong? leave them out",
+            len(wrong),
+            len(views),
+            short_list([name for name, _ in wrong]),
+            min(iou for _, iou in wrong),
+        )
 
 
 def check_in_picture(mask: Float[np.ndarray, "h w 1"], camera: Camera, obj: MeshObject) -> None:

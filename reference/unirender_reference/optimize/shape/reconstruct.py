@@ -1,5 +1,6 @@
 """A mesh from masks alone: visual hull, then Gauss-Newton steps towards the soft outlines, then charts."""
 
+import logging
 import time
 from collections.abc import Callable
 
@@ -10,9 +11,10 @@ from unirender_reference.optimize.shape.bounds import check_reach
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.charts import unwrap
 from unirender_reference.optimize.shape.config import ShapeConfig
-from unirender_reference.optimize.shape.coverage import masks_of
+from unirender_reference.optimize.shape.coverage import coverage_of, covered_otherwise, masks_of
 from unirender_reference.optimize.shape.fit import MeshFit
 from unirender_reference.optimize.shape.hull import extract, visual_hull
+from unirender_reference.optimize.shape.placement import short_list
 from unirender_reference.optimize.shape.topology import vertex_normals
 from unirender_reference.optimize.views import Step, Views
 from unirender_reference.shapes import MeshObject
@@ -20,9 +22,13 @@ from unirender_reference.shapes.mesh_object import RECONSTRUCTION
 
 GREY = 0.5
 
+_log = logging.getLogger("unirender.optimize")
+
 
 def reconstruct(views: Views, config: ShapeConfig, on_step: Callable[[Step], bool] | None = None) -> MeshObject:
     """The mesh of an object that fits its masks, grey, with charts, in the world of the views.
+
+    Masks that contradict each other are logged.
 
     Its bounding sphere has a radius of 1 as far as that of the object has in the views' world.
 
@@ -38,7 +44,17 @@ def reconstruct(views: Views, config: ShapeConfig, on_step: Callable[[Step], boo
     cameras, masks = Cameras(views.seen), masks_of(views.seen)
     fit = fit_masks(visual_hull(masks, cameras, config.cells), masks, cameras, config, on_step)
     check_reach(float(np.linalg.norm(fit.vertices, axis=1).max()), len(masks))
-    return charted_object(fit.vertices, fit.faces)
+    found = charted_object(fit.vertices, fit.faces)
+    if cut := covered_otherwise(views.seen, coverage_of(views.seen, found)):
+        _log.warning(
+            "the masks contradict each other: what lies inside all of them is not what %d of %d show (%s), IoU down to "
+            "%.2f; the pose or the mask of a picture is wrong, perhaps of another one: leave pictures out in turn",
+            len(cut),
+            len(views.seen),
+            short_list([name for name, _ in cut]),
+            min(iou for _, iou in cut),
+        )
+    return found
 
 
 def fit_masks(

@@ -12,9 +12,8 @@ from types import MappingProxyType
 
 from unirender.errors import UsageError
 from unirender_reference.optimize.machine import require_memory
+from unirender_reference.optimize.transport.config import MATRIX_BYTES
 from unirender_reference.option_checks import require_least
-
-MATRIX_BYTES = 96.0  # of memory for a pixel and a column of the light: 24 matrices (`transport.matrices`)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender_reference.arrays import aligned, components
+from unirender_reference.arrays import components
 from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.views import View
 from unirender_reference.passes import derive_seed
@@ -162,22 +162,26 @@ def _trace(
     import drjit as dr
 
     mi = mitsuba()
-    width, covered = mask.shape[1], np.flatnonzero(mask[..., 0] > 0)
+    covered = np.flatnonzero(mask[..., 0] > 0)
     count = len(covered) * samples
-    pixel = dr.gather(mi.UInt32, mi.UInt32(aligned(covered.astype(np.uint32))), dr.arange(mi.UInt32, count) // samples)
+    owner = dr.arange(mi.UInt32, count) // samples
+    row, column = np.divmod(covered, mask.shape[1])
+    corner = dr.gather(mi.Point2f, mi.Point2f(*components(np.stack([column, row], axis=1))), owner)
     sampler = stratified_sampler(samples, count, seed)
-    corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
-    position = (corner + sampler.next_2d()) / mi.Point2f(size[1], size[0])
-    ray, _ = mi.load_dict(sensor).sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
+    scale = mi.Point2f(*(dr.opaque(mi.Float, float(1 / np.float32(side))) for side in reversed(size)))
+    ray, _ = mi.load_dict(sensor).sample_ray(0.0, 0.5, (corner + sampler.next_2d()) * scale, mi.Point2f(0.5))
     point = scene.ray_intersect(ray)
     to_viewer = -ray.d
     normal = dr.select(dr.dot(point.sh_frame.n, to_viewer) < 0, -point.sh_frame.n, point.sh_frame.n)
     side = dr.select(dr.dot(point.n, to_viewer) < 0, -point.n, point.n)
-    hit = np.array(point.is_valid()).reshape(-1, samples)
+    found, valid = (point.p, normal, side, to_viewer, point.uv), point.is_valid()
+    dr.eval(found, valid)  # each would be traced for
+    hit = np.array(valid).reshape(-1, samples)
     chosen = hit.any(axis=1)
 
     def rows(vectors: Any) -> np.ndarray:
-        values = np.array(vectors).T.reshape(len(covered), samples, -1)[chosen]
+        values = np.stack([np.array(component) for component in vectors], axis=1)
+        values = values.reshape(len(covered), samples, -1)[chosen]
         return np.where(hit[chosen][..., None], values, 0).astype(np.float32)
 
-    return (covered[chosen], *(rows(vectors) for vectors in (point.p, normal, side, to_viewer, point.uv)), hit[chosen])
+    return (covered[chosen], *map(rows, found), hit[chosen])

@@ -7,6 +7,7 @@ from unirender.errors import UnirenderError, UsageError
 from unirender_reference.option_checks import require_least, require_one_of
 
 LEAST_PIXELS = 16
+MATRIX_BYTES = 96.0  # of memory for a pixel and a column of the light: 24 matrices (`matrices`)
 
 Materials = Literal["one", "maps"]
 

@@ -234,6 +234,7 @@ def _by_lobe(surface: _Surface, basis: LightBasis, grid: LightGrid, roughness: f
     for value in (gloss, gloss * schlick(dr.dot(half, local))):
         total = dr.zeros(mi.Float, surface.pixels * grid.count)
         for column, share in shares:
-            dr.scatter_reduce(dr.ReduceOp.Add, total, value * share, pixel + column, seen)
+            # No copies for each thread, as small arrays have by default: their size would be part of the kernel.
+            dr.scatter_reduce(dr.ReduceOp.Add, total, value * share, pixel + column, seen, dr.ReduceMode.Local)
         parts.append(np.array(total).reshape(surface.pixels, grid.count))
     return parts
