@@ -202,6 +202,8 @@ def test_share_of_textured_objects():
         ({"faces": np.array([[0, 1, 9]], np.int32)}, "outside the 4 vertices"),
         ({"normals": np.zeros((4, 3), np.float32)}, "unit vectors"),
         ({"albedo": np.full(3, 1.5, np.float32)}, r"within \[0, 1\]"),
+        ({"albedo": np.array([0.5, -0.1, 0.5], np.float32)}, r"within \[0, 1\]"),
+        ({"albedo": np.array([0.5, np.nan, 0.5], np.float32)}, r"within \[0, 1\]"),
         ({"albedo": np.full((4, 4, 3), 0.5, np.float32)}, "uv absent"),
         ({"vertices": np.full((4, 3), np.nan, np.float32)}, "finite"),
         ({"vertices": np.full((4, 3), 0.1, np.float32)}, "radius 1"),
