@@ -190,6 +190,37 @@ def test_a_texture_has_the_place_and_the_size_of_its_part():
     assert len(kinds - {"constant"}) >= 3
 
 
+# Split, seed, family -> spread of the vertices along each axis, and mean albedo: one of each family, two assemblies.
+OF_SEED = {
+    ("train", 0, "smooth_union"): ((0.479, 0.380, 0.381), (0.446, 0.222, 0.283)),
+    ("train", 1, "turned"): ((0.361, 0.291, 0.555), (0.378, 0.276, 0.338)),
+    ("train", 2, "rounded_box"): ((0.501, 0.503, 0.539), (0.324, 0.141, 0.324)),
+    ("train", 7, "prism"): ((0.552, 0.262, 0.476), (0.452, 0.632, 0.217)),
+    ("train", 8, "cylinder"): ((0.385, 0.370, 0.600), (0.375, 0.253, 0.191)),
+    ("train", 10, "revolution"): ((0.533, 0.323, 0.392), (0.253, 0.227, 0.236)),
+    ("train", 11, "assembly"): ((0.365, 0.275, 0.414), (0.300, 0.258, 0.295)),
+    ("train", 12, "shell"): ((0.293, 0.147, 0.553), (0.039, 0.115, 0.083)),
+    ("train", 14, "assembly"): ((0.324, 0.359, 0.311), (0.148, 0.257, 0.128)),
+    ("train", 16, "displaced_sphere"): ((0.435, 0.451, 0.427), (0.413, 0.382, 0.445)),
+    ("train", 19, "smooth_difference"): ((0.499, 0.488, 0.437), (0.152, 0.152, 0.112)),
+    ("test", 0, "gyroid"): ((0.373, 0.375, 0.364), (0.349, 0.015, 0.287)),
+    ("test", 1, "displaced_union"): ((0.329, 0.395, 0.529), (0.247, 0.100, 0.065)),
+    ("test", 2, "stacked_blobs"): ((0.201, 0.296, 0.534), (0.513, 0.414, 0.078)),
+    ("test", 4, "supershape"): ((0.502, 0.437, 0.484), (0.415, 0.110, 0.122)),
+}
+
+
+@pytest.mark.parametrize("which", OF_SEED, ids=str)
+def test_the_object_of_a_seed_is_what_it_was(which):
+    """A data set says no more of an object than its seed."""
+    split, seed, family = which
+    obj = make_object(seed, split)
+    assert obj.family == family
+    spread, color = OF_SEED[which]
+    np.testing.assert_allclose(obj.vertices.std(axis=0), spread, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(obj.albedo.reshape(-1, 3).mean(axis=0), color, rtol=0, atol=2e-3)
+
+
 def test_share_of_textured_objects():
     textured = [make_object(seed, "train").albedo.ndim == 3 for seed in range(12)]
     assert 0.4 < np.mean(textured) < 0.95
