@@ -1,5 +1,6 @@
 """The light table: balls under a light, the rows that a found light must beat, and lights from folders."""
 
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import environment_directions, resample_environment
+from unirender.light.environment import environment_directions, mean_radiance, resample_environment
 from unirender_evaluation.bounds import TRUE_LIGHT, ceiling_jobs
 from unirender_evaluation.claims import light_claims
 from unirender_evaluation.engine import answer, score
@@ -19,7 +20,7 @@ from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL, ball_mask,
 from unirender_evaluation.light_statistics import light_means, light_statistics, write_statistics
 from unirender_evaluation.methods.light import MeanLight, UniformLight
 from unirender_evaluation.methods.mitsuba import mitsuba_jobs
-from unirender_evaluation.metrics import metric_key
+from unirender_evaluation.metrics import LOG_EPSILON, metric_key
 from unirender_evaluation.predictions.check import PredictionError, check_predictions
 from unirender_evaluation.predictions.folder import PredictionFolder
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
@@ -157,7 +158,8 @@ def test_the_mean_light_is_measured(tmp_path: Path) -> None:
     import json
     import tarfile
 
-    lights = [np.full((16, 32, 3), value, np.float32) for value in (0.2, 0.8)]
+    lights = [np.full((16, 32, 3), 0.2, np.float32) for _ in range(2)]
+    lights[1][:8] = 0.8
     with tarfile.open(tmp_path / "shard-000000.tar", "w") as tar:
         for i, light in enumerate(lights):
             path = write_one(tmp_path, light)
@@ -167,7 +169,11 @@ def test_the_mean_light_is_measured(tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text(json.dumps({"config": {"split": "train", "seed": 3, "resolution": 32}}))
     assert len(list(light_means(tmp_path))) == 2
     text = write_statistics(tmp_path, tmp_path / "out.toml")
-    assert "[0.5000, 0.5000, 0.5000]" in text  # rows alike, as bright as the lights' mean
+    rows = np.array(tomllib.loads(text)["rows"], np.float32)
+    upper = np.sqrt((0.2 + LOG_EPSILON) * (0.8 + LOG_EPSILON)) - LOG_EPSILON
+    np.testing.assert_allclose(rows[:8] / rows[8:], upper / 0.2, rtol=2e-3)
+    bright = mean_radiance(np.repeat(rows[:, None], 32, axis=1))
+    np.testing.assert_allclose(bright, np.mean([mean_radiance(light) for light in lights], axis=0), rtol=2e-3)
     assert "2 lights" in text
     empty = tmp_path / "empty"
     empty.mkdir()
