@@ -159,6 +159,13 @@ def test_relighting_with_true_maps(suite: Suite) -> None:
         assert score(task, Prediction(image=image), ())["relit.psnr@masked-srgb-raw"] > 55
 
 
+def test_who_can_do_one_of_the_things_that_are_asked_takes_part(suite: Suite) -> None:
+    task = next(tasks(suite, "relighting", "from-image-sd", [suite.scenes[0]]))
+    assert task.asks == ("relight", "decompose")
+    for method, expected in ((UneditedInput(), True), (ConstantMaterial(), True), (Composite(), False)):
+        assert make_row(method, "baseline").answers(task, list(suite.scenes)) == expected
+
+
 def test_capabilities_are_checked() -> None:
     assert methods.capabilities(UneditedInput()) == ("edit", "relight")
     assert methods.capabilities(Composite()) == ("render",)
