@@ -27,7 +27,7 @@ def _off(by: float, function: Callable[..., float]) -> Callable[..., float]:
 
 
 @pytest.mark.parametrize(
-    ("name", "label", "by"), [("psnr", "PSNR", 1e-4), ("ssim", "SSIM", 1e-6), ("ciede2000", "CIEDE2000", 0.02)]
+    ("name", "label", "by"), [("psnr", "PSNR", 1e-4), ("ssim", "SSIM", -1e-6), ("ciede2000", "CIEDE2000", 0.02)]
 )
 def test_a_wrong_metric_is_found(monkeypatch: pytest.MonkeyPatch, name: str, label: str, by: float) -> None:
     where = crosscheck if name == "ssim" else metrics
@@ -36,9 +36,10 @@ def test_a_wrong_metric_is_found(monkeypatch: pytest.MonkeyPatch, name: str, lab
     assert wrong == {label}
 
 
-def test_wrong_weights_of_lpips_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("factor", [0.99, 1.01])
+def test_wrong_weights_of_lpips_are_found(factor: float, monkeypatch: pytest.MonkeyPatch) -> None:
     network = lpips.Lpips("alex")
-    network.network.heads[0].data *= 1.01
+    network.network.heads[0].data *= factor
     monkeypatch.setattr(lpips, "load", lambda _: network)
     assert {item.metric for item in agreements(PAIRS[:1]) if not item.holds} == {"LPIPS-Alex"}
 

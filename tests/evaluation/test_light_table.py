@@ -15,14 +15,14 @@ from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, image_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import environment_directions, resample_environment
+from unirender.light.environment import environment_directions, mean_radiance, resample_environment
 from unirender_evaluation.bounds import TRUE_LIGHT, ceiling_jobs
 from unirender_evaluation.claims import light_claims
 from unirender_evaluation.engine import answer, score
-from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL, ball_mask, ball_normals, ball_values, balls
+from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL, ball_mask, ball_values, balls
 from unirender_evaluation.methods.light import MeanLight, UniformLight
 from unirender_evaluation.methods.mitsuba import mitsuba_jobs
-from unirender_evaluation.metrics import metric_key
+from unirender_evaluation.metrics import LOG_EPSILON, metric_key
 from unirender_evaluation.predictions.check import PredictionError, check_predictions
 from unirender_evaluation.predictions.folder import PredictionFolder
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
@@ -72,8 +72,9 @@ def test_balls_in_uniform_light_are_uniform() -> None:
 @pytest.mark.parametrize(("direction", "axis"), [((1, 0, 0.3), 0), ((-1, 0, 0.3), 0), ((0, 1, 0.3), 1)])
 def test_a_lamp_lights_its_own_side(direction: tuple[float, float, float], axis: int) -> None:
     """By the contract's axes: +x is right, +y is up, as on the object in the picture."""
+    y, x = 1 - np.indices((32, 32)) / 15.5
     for ball in balls(lamp(*direction), 32).values():
-        place = (ball_normals(32)[..., axis] * ball[..., 0]).sum() / ball[..., 0].sum()
+        place = ((-x, y)[axis] * ball[..., 0]).sum() / ball[..., 0].sum()
         assert place * direction[axis] > 0.3
 
 
@@ -162,9 +163,11 @@ def test_the_trivial_rows_constants_are_measured(tmp_path: Path) -> None:
     shared = {"mask.Y": covered, **{f"albedo.{c}": covered * np.float32(0.25) for c in "RGB"}}
     shared |= {f"normal.{axis}": covered * np.float32(n) for axis, n in zip("XYZ", (0.6, 0, 0.8), strict=True)}
     files = {"a.shared.exr": exr_bytes(shared, half=False)}
-    for i, value in enumerate((0.2, 0.8)):
-        light = {c: np.full((16, 32), value, np.float32) for c in "RGB"}
-        files[f"a.l{i}.environment.exr"] = exr_bytes(light, half=False)
+    lights = [np.full((16, 32, 3), 0.2, np.float32) for _ in range(2)]
+    lights[1][:8] = 0.8
+    for i, light in enumerate(lights):
+        channels = {c: light[..., k] for k, c in enumerate("RGB")}
+        files[f"a.l{i}.environment.exr"] = exr_bytes(channels, half=False)
     with tarfile.open(tmp_path / "shard-000000.tar", "w") as tar:
         for name, content in files.items():
             info = tarfile.TarInfo(name)
@@ -175,7 +178,11 @@ def test_the_trivial_rows_constants_are_measured(tmp_path: Path) -> None:
     np.testing.assert_allclose(of_objects["albedo_srgb"], 0.5371, rtol=0, atol=1e-4)  # 0.25, encoded
     assert of_objects["normal"] == [0.6, 0.0, 0.8]
     assert "1 training groups (split train, seed 3, 32 px)" in of_objects["provenance"]
-    assert of_lights["rows"] == [[0.5, 0.5, 0.5]] * 16  # alike, as bright as the lights' mean
+    rows = np.array(of_lights["rows"], np.float32)
+    upper = np.sqrt((0.2 + LOG_EPSILON) * (0.8 + LOG_EPSILON)) - LOG_EPSILON
+    np.testing.assert_allclose(rows[:8] / rows[8:], upper / 0.2, rtol=2e-3)
+    bright = mean_radiance(np.repeat(rows[:, None], 32, axis=1))
+    np.testing.assert_allclose(bright, np.mean([mean_radiance(light) for light in lights], axis=0), rtol=2e-3)
     assert "2 lights" in of_lights["provenance"]
     empty = tmp_path / "empty"
     empty.mkdir()

@@ -79,7 +79,8 @@ def test_kept_features_change_nothing(alex: Lpips) -> None:
 @pytest.mark.parametrize(
     ("a", "match"),
     [
-        (np.zeros((1, 16, 16, 3), np.float32), "at least 31"),
+        (np.zeros((1, 64, 30, 3), np.float32), "at least 31"),
+        (np.zeros((1, 30, 64, 3), np.float32), "at least 31"),
         (np.full((1, 64, 64, 3), 1.5, np.float32), "display values"),
         (np.zeros((1, 64, 64, 3), np.float32) - 1, "display values"),
     ],

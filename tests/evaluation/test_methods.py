@@ -14,7 +14,7 @@ from unirender.intrinsics import Intrinsics
 from unirender_evaluation.claims import SHADOWED
 from unirender_evaluation.engine import Prediction, answer, method_jobs, score
 from unirender_evaluation.methods import method as methods
-from unirender_evaluation.methods.composite import Composite, CompositeOf, SplitSum
+from unirender_evaluation.methods.composite import Composite, CompositeOf, SplitSum, with_derived_light
 from unirender_evaluation.methods.trivial import (
     ConstantMaterial,
     InputAsAlbedo,
@@ -64,6 +64,16 @@ def test_composite_is_exact_where_the_truth_is_a_composite(suite: Suite) -> None
             wrong = Composite().render(maps.replace(albedo=0.9 * maps.albedo))
             assert good > 55
             assert score(task, Prediction(image=wrong), ())[key] < 45
+
+
+def test_composite_derives_the_one_that_it_was_not_given(suite: Suite) -> None:
+    maps = next(tasks(suite, "rendering", "given-light", list(suite.scenes))).inputs["render"]["intrinsics"]
+    derived, outside = with_derived_light(maps), maps.require("mask")["mask"] == 0
+    for name in ("specular", "diffuse"):
+        assert not (derived.require(name)[name] * outside).any()
+        np.testing.assert_array_equal(
+            Composite().render(derived.replace(**{name: None})), Composite().render(maps), err_msg=name
+        )
 
 
 def test_split_sum_adds_the_angle_of_the_fresnel_term(suite: Suite) -> None:
@@ -147,6 +157,13 @@ def test_relighting_with_true_maps(suite: Suite) -> None:
         oracle = TrueMaps(suite.intrinsics(task.scene, suite.spec.base))
         image = CompositeOf(oracle, anchored=False).relight(**task.inputs["relight"])
         assert score(task, Prediction(image=image), ())["relit.psnr@masked-srgb-raw"] > 55
+
+
+def test_who_can_do_one_of_the_things_that_are_asked_takes_part(suite: Suite) -> None:
+    task = next(tasks(suite, "relighting", "from-image-sd", [suite.scenes[0]]))
+    assert task.asks == ("relight", "decompose")
+    for method, expected in ((UneditedInput(), True), (ConstantMaterial(), True), (Composite(), False)):
+        assert make_row(method, "baseline").answers(task, list(suite.scenes)) == expected
 
 
 def test_capabilities_are_checked() -> None:

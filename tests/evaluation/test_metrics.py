@@ -188,11 +188,11 @@ def test_radiance_below_zero_is_none_in_logarithms() -> None:
 
 
 def test_relative_rmse_by_hand() -> None:
-    p, t = (np.array(values, np.float32).reshape(1, 2, 1) for values in ((2, 4), (1, 3)))
+    t = np.array([[[0.5, 1, 1.5], [2, 3, 4]]], np.float32)  # of mean 1 and 3
     w = np.array([1, 0.5], np.float32).reshape(1, 2, 1)
-    assert metrics.rmse_relative(p, t, w) == pytest.approx(1 / ((1 + 0.5 * 3) / 1.5))
+    assert metrics.rmse_relative(t + 1, t, w) == pytest.approx(1 / ((1 + 0.5 * 3) / 1.5))
     with pytest.raises(UnirenderError, match="the truth is black"):
-        metrics.rmse_relative(p, 0 * t, w)
+        metrics.rmse_relative(t, 0 * t, w)
 
 
 def test_ciede2000_is_scikit_images() -> None:

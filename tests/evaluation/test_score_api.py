@@ -62,7 +62,7 @@ def test_a_protocol_chooses_among_the_same_numbers() -> None:
 
 def test_a_light_is_scored_as_the_benchmark_scores_it_and_not_by_the_texels_of_its_map() -> None:
     light = np.full((16, 32, 3), 0.1, np.float32)
-    light[4, 9] = 50
+    light[4, 9], light[12, 3] = 50, 0
     true = TRUE.replace(environment=light)
     flat = {shape: FOUND.replace(environment=np.full((*shape, 3), 0.4, np.float32)) for shape in ((2, 2), (16, 32))}
     coarse, fine = (score(found, true) for found in flat.values())

@@ -293,6 +293,12 @@ def test_killed_run_resumes_to_the_same_manifest(whole: Path, tmp_path: Path) ->
     assert sorted(path.name for path in out.iterdir()) == ["manifest.json", "shard-000000.tar"]
 
 
+def test_a_lock_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / ".lock").mkdir()
+    with pytest.raises(UnirenderError, match=r"\.lock: cannot be made \(Is a directory\); choose another --out"):
+        generate(config(tmp_path))
+
+
 def test_a_file_is_no_folder_for_shards(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("precious")
     with pytest.raises(UnirenderError, match="file: is a file, expected a folder"):

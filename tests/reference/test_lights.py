@@ -50,6 +50,28 @@ def test_make_light_repeats_and_is_normalised(split):
         np.testing.assert_array_equal(light.environment, lights.make_light(seed, split).environment)
 
 
+# Seed of `train` -> mean direction by luminance, and mean color: one light of each kind, and a tilted one.
+OF_SEED = {
+    0: ((-0.190, 0.291, 0.063), (1.046, 0.995, 0.912)),  # bundled
+    1: ((0.518, 0.348, 0.291), (0.835, 1.008, 1.406)),  # softboxes
+    3: ((0.152, 0.226, 0.091), (0.822, 1.016, 1.366)),  # sunsky
+    13: ((-0.097, 0.466, 0.478), (0.932, 1.002, 1.176)),  # bundled, tilted
+    15: ((0.091, 0.043, 0.322), (1.220, 0.955, 0.797)),  # gradient
+    65: ((0.000, 0.000, 0.000), (1.287, 0.949, 0.660)),  # constant
+}
+
+
+@pytest.mark.parametrize("seed", OF_SEED)
+def test_the_light_of_a_seed_is_what_it_was(seed):
+    """A data set says no more of a light than its seed."""
+    environment = lights.make_light(seed, "train").environment
+    direction, color = OF_SEED[seed]
+    weight = texel_solid_angles(64, 128) * luminance(environment)
+    found = np.einsum("hw,hwc->c", weight, environment_directions(64, 128)) / weight.sum()
+    np.testing.assert_allclose(found, direction, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(mean_radiance(environment), color, rtol=0, atol=1e-3)
+
+
 def test_shares_of_kinds_and_disjoint_pools():
     drawn = {split: [lights.make_light(seed, split) for seed in range(80)] for split in ("train", "test")}
     maps = {}

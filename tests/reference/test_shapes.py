@@ -190,6 +190,41 @@ def test_a_texture_has_the_place_and_the_size_of_its_part():
     assert len(kinds - {"constant"}) >= 3
 
 
+# Split, seed, family, texture -> spread of the vertices along each axis, and mean albedo of every 97th texel: one of
+# each family, two assemblies, and one of most textures.
+OF_SEED = {
+    ("train", 0, "smooth_union", "checker"): ((0.479, 0.380, 0.381), (0.449, 0.228, 0.288)),
+    ("train", 1, "turned", "cells"): ((0.361, 0.291, 0.555), (0.376, 0.274, 0.336)),
+    ("train", 2, "rounded_box", "cells"): ((0.501, 0.503, 0.539), (0.327, 0.143, 0.332)),
+    ("train", 7, "prism", "constant"): ((0.552, 0.262, 0.476), (0.452, 0.632, 0.217)),
+    ("train", 8, "cylinder", "constant"): ((0.385, 0.370, 0.600), (0.375, 0.253, 0.191)),
+    ("train", 10, "revolution", "constant"): ((0.533, 0.323, 0.392), (0.253, 0.227, 0.236)),
+    ("train", 11, "assembly", "constant+constant+cells"): ((0.365, 0.275, 0.414), (0.302, 0.257, 0.295)),
+    ("train", 12, "shell", "cells"): ((0.293, 0.147, 0.553), (0.039, 0.114, 0.083)),
+    ("train", 14, "assembly", "checker+bands+clouds"): ((0.324, 0.359, 0.311), (0.148, 0.256, 0.127)),
+    ("train", 16, "displaced_sphere", "gradient"): ((0.435, 0.451, 0.427), (0.413, 0.383, 0.445)),
+    ("train", 19, "smooth_difference", "cells"): ((0.499, 0.488, 0.437), (0.152, 0.152, 0.113)),
+    ("train", 23, "displaced_sphere", "spots"): ((0.320, 0.665, 0.331), (0.119, 0.118, 0.127)),
+    ("train", 38, "displaced_union", "wood"): ((0.474, 0.390, 0.308), (0.202, 0.213, 0.226)),
+    ("train", 50, "turned", "stripes"): ((0.377, 0.412, 0.428), (0.378, 0.419, 0.333)),
+    ("test", 0, "gyroid", "constant"): ((0.373, 0.375, 0.364), (0.349, 0.015, 0.287)),
+    ("test", 1, "displaced_union", "gradient"): ((0.329, 0.395, 0.529), (0.250, 0.102, 0.063)),
+    ("test", 2, "stacked_blobs", "speckle"): ((0.201, 0.296, 0.534), (0.489, 0.401, 0.079)),
+    ("test", 4, "supershape", "marble"): ((0.502, 0.437, 0.484), (0.390, 0.113, 0.128)),
+}
+
+
+@pytest.mark.parametrize("which", OF_SEED, ids=str)
+def test_the_object_of_a_seed_is_what_it_was(which):
+    """A data set says no more of an object than its seed."""
+    split, seed, family, texture = which
+    obj = make_object(seed, split)
+    assert (obj.family, obj.provenance["texture"]) == (family, texture)
+    spread, color = OF_SEED[which]
+    np.testing.assert_allclose(obj.vertices.std(axis=0), spread, rtol=0, atol=2e-3)
+    np.testing.assert_allclose(obj.albedo.reshape(-1, 3)[::97].mean(axis=0), color, rtol=0, atol=2e-3)
+
+
 def test_share_of_textured_objects():
     textured = [make_object(seed, "train").albedo.ndim == 3 for seed in range(12)]
     assert 0.4 < np.mean(textured) < 0.95
@@ -202,6 +237,8 @@ def test_share_of_textured_objects():
         ({"faces": np.array([[0, 1, 9]], np.int32)}, "outside the 4 vertices"),
         ({"normals": np.zeros((4, 3), np.float32)}, "unit vectors"),
         ({"albedo": np.full(3, 1.5, np.float32)}, r"within \[0, 1\]"),
+        ({"albedo": np.array([0.5, -0.1, 0.5], np.float32)}, r"within \[0, 1\]"),
+        ({"albedo": np.array([0.5, np.nan, 0.5], np.float32)}, r"within \[0, 1\]"),
         ({"albedo": np.full((4, 4, 3), 0.5, np.float32)}, "uv absent"),
         ({"vertices": np.full((4, 3), np.nan, np.float32)}, "finite"),
         ({"vertices": np.full((4, 3), 0.1, np.float32)}, "radius 1"),

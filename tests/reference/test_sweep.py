@@ -89,6 +89,8 @@ def test_pairs_come_from_their_nodes(renderer: Renderer) -> None:
     assert variance is not None
     assert sweep.node_variance is not None
     assert sweep.mean.shape == variance.shape == (1, 5, 24, 24, 4)
+    taken = sweep.node_spp / node_shares(QUADRATIC, METALLIC) / 256
+    assert ((taken >= 1) & (taken < 2)).all(), "rounded up to the sampler's grid"
     np.testing.assert_allclose(sweep.mean[:, ::2], sweep.node_mean, rtol=1e-6)
     weights = np.array([0.375, 0.75, -0.125])  # of m = 0.25
     np.testing.assert_allclose(sweep.mean[0, 1], np.tensordot(weights, sweep.node_mean[0], 1), atol=1e-6)

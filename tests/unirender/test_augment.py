@@ -1,11 +1,21 @@
 """The augmentation functions by themselves: group laws, closed forms and errors."""
 
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from unirender.errors import UnirenderError
 from unirender.light.symmetries import permute_channels, scale_light
-from unirender.training.augmentations.augment import from_maps, interpolate_metallic, mix_lights, to_maps
+from unirender.training.augmentations.augment import (
+    DEFAULT_AUGMENTATION,
+    draw,
+    from_maps,
+    interpolate_metallic,
+    mix_lights,
+    to_maps,
+)
 
 
 def equal(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
@@ -58,6 +68,27 @@ def test_metallic_interpolation_is_exact_for_quadratics() -> None:
     assert np.abs(linear - (a + b * 0.3 + c * 0.09)).max() > 1e-2
     with pytest.raises(UnirenderError, match="metallic"):
         interpolate_metallic(nodes, 1.1)
+
+
+def test_draws_fill_the_ranges_that_are_stated_and_no_more() -> None:
+    rng, config = np.random.default_rng(0), replace(DEFAULT_AUGMENTATION, move=1.0)
+    draws = [draw(rng, config, 4, 3) for _ in range(2000)]
+    moves = [one.move for one in draws if one.move is not None]
+    assert len(moves) == len(draws)
+    for found, most in (
+        ([math.degrees(move.roll) for move in moves], 25),
+        ([math.log(move.zoom) for move in moves], 0.18),
+        ([move.shift[0] for move in moves], 0.06),
+        ([move.shift[1] for move in moves], 0.06),
+    ):
+        assert -most <= min(found) < -0.98 * most
+        assert 0.98 * most < max(found) <= most
+    metallic = np.array([one.metallic for one in draws])
+    assert (metallic.min(), metallic.max()) == (0, 1)
+    for end in (0, 1):
+        assert 0.03 < (metallic == end).mean() < 0.06  # 5 of 110
+    assert {one.roughness_index for one in draws} == {0, 1, 2}
+    np.testing.assert_allclose(np.mean([one.weights.sum(axis=0) for one in draws], axis=0), 1, atol=0.1)
 
 
 def test_wrong_orders_are_refused() -> None:

@@ -150,7 +150,7 @@ def test_other_resolutions_and_odd_sizes() -> None:
     assert out.image.shape == (3, 4, 18, 22)
 
 
-@pytest.mark.parametrize("levels", [(), (0, 1), (2,)])
+@pytest.mark.parametrize("levels", [(), (0, 1, 2), (2,)])
 def test_the_mid_block_attends_over_all_pixels_at_any_rate(levels: tuple[int, ...]) -> None:
     """The light is not aligned with the picture's pixels and reaches them all there."""
     model = small(attention_levels=levels)

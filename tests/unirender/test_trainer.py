@@ -7,6 +7,7 @@ import io
 import json
 import math
 import os
+import platform
 import re
 import shutil
 import threading
@@ -25,7 +26,8 @@ from torch import Tensor, nn
 
 from unirender.diffusion.inference import infer_attributes, infer_image
 from unirender.errors import UnirenderError
-from unirender.models.precision import cpu_has_bf16, resolve_device, resolve_dtype
+from unirender.models import precision
+from unirender.models.precision import resolve_device, resolve_dtype
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.score import Score
 from unirender.training.augmentations.augment import NO_AUGMENTATION
@@ -604,11 +606,23 @@ def test_presets_are_rows() -> None:
 def test_device_and_dtype_names() -> None:
     assert resolve_device("auto").type in ("cuda", "mps", "cpu")
     assert resolve_dtype("float16", CPU) == torch.float16
-    assert resolve_dtype("auto", CPU) == (torch.bfloat16 if cpu_has_bf16() else torch.float32)
     with pytest.raises(UnirenderError, match="expected one of: auto"):
         resolve_dtype("int8", CPU)
     with pytest.raises(UnirenderError, match="not available here"):
         resolve_device("tpu")
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [("avx512_bf16", torch.bfloat16), ("amx_bf16 amx_tile", torch.bfloat16), ("avx512f", torch.float32)],
+)
+def test_auto_is_bf16_where_the_cpu_multiplies_it(
+    flags: str, expected: torch.dtype, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "cpuinfo").write_text(f"processor : 0\nflags : fpu {flags} sse2\nprocessor : 1\n")
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(precision, "Path", lambda path: tmp_path / Path(path).name)
+    assert resolve_dtype("auto", CPU) == expected
 
 
 def test_a_run_starts_from_other_weights(tmp_path: Path) -> None:

@@ -173,6 +173,7 @@ def test_tau_ranks_the_sweep(parameter: str, suite: Suite, monkeypatch: pytest.M
     assert test.run(backwards, stage) == pytest.approx(-1.0)
     assert test.run(test.twin, stage) == 0.0
     assert test.fails(0.0, 1.0)
+    assert not test.fails(1.0, 1.0)
 
 
 def test_kendall_tau_counts_pairs() -> None:

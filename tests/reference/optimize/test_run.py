@@ -222,6 +222,13 @@ def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path: Path):
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
 
 
+def test_a_mesh_and_a_start_with_its_own_are_one_too_many(tmp_path: Path):
+    start = truth()
+    with pytest.raises(UnirenderError, match="got a mesh and a start with a mesh of its own, expected one of them"):
+        optimize(rendered_views(start), start.obj, CONFIG, tmp_path / "run", start)
+    assert not (tmp_path / "run").exists()
+
+
 def test_two_processes_on_one_folder(tmp_path: Path):
     header = {"config": {}, "inputs": {}, "versions": {}}
     with open_run(tmp_path / "run", header), pytest.raises(UnirenderError, match="another run is writing"):

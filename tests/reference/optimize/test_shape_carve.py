@@ -72,6 +72,14 @@ def test_what_agrees_stays() -> None:
     assert carve(hull, odd.astype(np.float32), masks, cameras, 0.03)[1] < 0.5
 
 
+def test_two_pictures_take_nothing_away() -> None:
+    seen = _ball().seen
+    hull = visual_hull(masks_of(seen), Cameras(seen), 24)
+    two = seen[:2]
+    images = np.stack([np.full_like(view.image, value) for view, value in zip(two, (0.2, 0.8), strict=True)])
+    assert carve(hull, images, masks_of(two), Cameras(two), 0.03)[1] == 1
+
+
 def test_a_point_is_not_seen_through_the_object() -> None:
     """One side red, the other green: no point is asked to be both."""
     views = _ball()

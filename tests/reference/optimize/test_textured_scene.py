@@ -11,10 +11,13 @@ import refine_problems as problems
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
+from unirender_reference import shader
 from unirender_reference.backend import mitsuba
+from unirender_reference.optimize.refine import scene as refined
 from unirender_reference.optimize.refine.config import Space
 from unirender_reference.optimize.refine.parameters import LIMITS, NAMES, Name, parameter_gradient, to_map, to_parameter
 from unirender_reference.optimize.refine.scene import TexturedScene, maps_of
+from unirender_reference.passes import NAN_ATTEMPTS
 from unirender_reference.render import Renderer
 from unirender_reference.statistics import z_test
 
@@ -73,6 +76,28 @@ def test_a_wrong_image_gradient_is_refused(scene: TexturedScene) -> None:
     for wrong in (weight[:2], weight * np.nan):
         with pytest.raises(UnirenderError, match="expected finite"):
             scene.gradients(maps, wrong, 4, 0)
+
+
+@pytest.mark.parametrize("poisoned", [1, NAN_ATTEMPTS + 1])
+def test_derivatives_that_come_out_nan_are_drawn_again(
+    poisoned: int, scene: TexturedScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where those of one map alone do, be it of the last."""
+    maps, genuine, drawn = maps_of(problems.solution()), shader.gradient, []
+    weight = np.ones((COUNT, problems.SIDE, problems.SIDE, 3), np.float32)
+
+    def gradient(tensor: Any) -> np.ndarray:
+        drawn.append(tensor)
+        last = len(drawn) % len(NAMES) == 0 and len(drawn) <= poisoned * len(NAMES)
+        return genuine(tensor) * np.float32(np.nan if last else 1)
+
+    monkeypatch.setattr(refined, "gradient", gradient)
+    if poisoned > NAN_ATTEMPTS:
+        with pytest.raises(UnirenderError, match=f"derivatives stay NaN after {NAN_ATTEMPTS} seeds"):
+            scene.gradients(maps, weight, 4, 0)
+    else:
+        assert all(np.isfinite(value).all() for value in scene.gradients(maps, weight, 4, 0).values())
+    assert len(drawn) == min(poisoned + 1, NAN_ATTEMPTS + 1) * len(NAMES)
 
 
 def test_another_iteration_compiles_nothing(scene: TexturedScene) -> None:

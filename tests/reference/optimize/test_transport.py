@@ -8,6 +8,7 @@ from unirender.camera import Camera
 from unirender_reference.multiview import orbit
 from unirender_reference.optimize.surface.points import blocker, trace_points
 from unirender_reference.optimize.transport.light_grid import LightGrid
+from unirender_reference.optimize.transport.material_mix import Lobes, mixed
 from unirender_reference.optimize.transport.matrices import light_transport, refined
 from unirender_reference.optimize.transport.pixel_fit import Appearance, PixelFit, observe
 from unirender_reference.optimize.views import View
@@ -58,6 +59,19 @@ def test_matrices_times_light_are_the_direct_image(problem, roughness: float, me
     assert np.sqrt((error**2).mean()) < 0.08 * np.sqrt((truth**2).mean())
     off = modelled(problem, min(roughness + 0.2, 1), metallic - 0.3 if metallic > 0.5 else metallic + 0.3) - truth
     assert np.sqrt((off**2).mean()) > 1.5 * np.sqrt((error**2).mean())
+
+
+def test_all_materials_are_alike_at_grazing_angles_and_show_f0_or_their_colour_at_none() -> None:
+    """There W is G: the Fresnel term is 1 whatever the surface; and 0."""
+    rng = np.random.default_rng(1)
+    diffuse, gloss = rng.uniform(0, 1, (2, 3, 5)).astype(np.float32)
+    nothing, metallic = 0 * gloss, np.array([0, 0.3, 1])
+    grazing = mixed(Lobes(nothing, gloss, gloss), metallic)
+    np.testing.assert_allclose(grazing.v, gloss, rtol=1e-6)
+    assert not grazing.u.any()
+    straight, m = mixed(Lobes(diffuse, gloss, nothing), metallic), metallic[:, None]
+    np.testing.assert_allclose(straight.v, (1 - m) * 0.04 * gloss, rtol=1e-6)
+    np.testing.assert_allclose(straight.u, (1 - m) * diffuse + m * gloss, rtol=1e-6)
 
 
 def test_a_coarse_light_has_the_same_image(problem) -> None:
