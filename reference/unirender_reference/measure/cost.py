@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UsageError
 from unirender.system.wording import counted
-from unirender.system.worker_pool import WorkerPool
 
 if TYPE_CHECKING:
     from unirender_reference.render import Renderer
@@ -45,6 +44,7 @@ class Cost:
         from rich.console import Console
         from rich.table import Table
 
+        from unirender.system.worker_pool import WorkerPool
         from unirender_reference.plan import SHARD_GROUPS
 
         if min((*self.resolutions, self.spp, self.scenes, self.objects), default=0) < 1 or not self.resolutions:
