@@ -23,7 +23,7 @@ from unirender.light.surface_light import diffuse_light, specular_light
 from unirender.models.conditioning import DERIVED_FLAG
 from unirender.models.packing import TRIPLETS
 from unirender.pipelines.editing import under_light
-from unirender.pipelines.inputs import ready_to_render, told_derived
+from unirender.pipelines.rendered_maps import ready_to_render, told_derived
 from unirender.pipelines.results import EditResult
 from unirender.pipelines.shadowed_light import visible_shares
 from unirender.training.augmentations.augment import NO_AUGMENTATION

@@ -125,7 +125,7 @@ class Render:
         """Returns the exit status."""
         from unirender.files import new_folder, read_result, write_result
         from unirender.pipelines.editing import under_light
-        from unirender.pipelines.inputs import RENDER_NEEDS, ready_to_render, to_derive, told_derived, with_mask
+        from unirender.pipelines.rendered_maps import RENDER_NEEDS, ready_to_render, to_derive, told_derived, with_mask
 
         self.model.check()
         check_stops(self.exposure)

@@ -58,6 +58,21 @@ def is_twice_as_wide(height: int, width: int) -> bool:
     return height >= 2 and abs(width / height - 2) <= ASPECT_TOLERANCE
 
 
+def check_sphere(environment: Float[np.ndarray, "*n eh ew 3"]) -> None:
+    """Looks at the shape of a light.
+
+    Raises:
+        UnirenderError: it is not twice as wide as high, nor, with its first and last row at the poles, has equal steps
+            both ways; a light probe or a photograph, say.
+    """
+    height, width = environment.shape[-3:-1]
+    if not is_twice_as_wide(height, width) and width != 2 * (height - 1):
+        raise UnirenderError(
+            f"environment: got {width}x{height}, expected a lat-long map twice as wide as high; unwrap a light probe "
+            "first; of a photograph's file unirender_reference.lights.load_light(path, photograph=True) makes one"
+        )
+
+
 def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:
     """Unit directions of the texels, camera axes.
 

@@ -27,7 +27,7 @@ from unirender.models.conditioning import Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
 from unirender.models.packing import TRIPLETS
 from unirender.models.priors import Maps
-from unirender.pipelines.inputs import told_derived
+from unirender.pipelines.rendered_maps import told_derived
 from unirender.training.config import LossConfig
 from unirender.training.losses.consistency import Consistency
 from unirender.training.losses.terms import Errors, LossTerms, noise_like, predict
@@ -125,7 +125,7 @@ class LossFunction:
         """The maps that a renderer sees, in which s and d may have been derived from the light; and which lack shadows.
 
         Of those that have the shadows that are seen, d alone is said to lack others, as
-        `unirender.pipelines.inputs.told_derived` says it of a light that is given.
+        `unirender.pipelines.rendered_maps.told_derived` says it of a light that is given.
         """
         rows = clean & (batch["derived"].flatten() > 0) if "derived" in batch else None
         if rows is None or not rows.any():
