@@ -24,6 +24,8 @@ VOCABULARY = {
         "files",
         "intrinsics",
         "light.environment",
+        "light.for_mitsuba",
+        "light.resampling",
         "light.exposure",
         "light.ggx",
         "light.surface_light",

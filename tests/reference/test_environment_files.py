@@ -15,7 +15,7 @@ from unirender.errors import UnirenderError
 from unirender.exr import image_channels, on_pole_grid, read_exr, write_environment, write_exr
 from unirender.files import new_folder, write_result
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender.light.surface_light import diffuse_light, specular_light
 from unirender_reference.lights import load_light
 from unirender_reference.lights.files import BYTES_A_TEXEL, BYTES_OF_NONE

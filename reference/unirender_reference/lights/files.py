@@ -31,7 +31,8 @@ from unirender.blocks import by_rows
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, image_channels, on_pole_grid, pixel_count, read_exr
-from unirender.light.environment import check_shape, is_twice_as_wide, resample_environment
+from unirender.light.environment import check_shape, is_twice_as_wide
+from unirender.light.resampling import resample_environment
 from unirender.picture_files import display_files
 from unirender.picture_files.primaries import REC709, in_rec709
 from unirender.pictures import check_finite, negative_share

@@ -104,7 +104,7 @@ def buffer_tiles(sample: "Sample", background: float) -> "list[np.ndarray]":
     import numpy as np
 
     from unirender.color import image_srgb, srgb_decode
-    from unirender.light.environment import resample_environment
+    from unirender.light.resampling import resample_environment
     from unirender_reference.sheets import environment_preview
 
     maps = sample.intrinsics.maps

@@ -18,7 +18,7 @@ Axes: those of the camera, moved to the middle of the object: +x right, +y up, +
 on +z at `Camera.distance()`, where a unit sphere fills 0.9 of the frame's height, and the card is the plane z = 0. The
 middle of the light's map is +z. Light is in display units: a render at exposure 1 shows through sRGB what the picture
 showed. Mitsuba draws directions by the texels times sin(theta) and would miss light of the first or the last row that
-has little beside it: such a light is written with a row between each two (`unirender.light.environment.drawable`).
+has little beside it: such a light is written with a row between each two (`unirender.light.for_mitsuba.drawable`).
 
 What a card cannot show: it has one depth, so that nothing casts a shadow and the maps hold from the camera's place
 only; and normals that face away from the viewer are bent until they do not (a renderer would show them black or
