@@ -56,7 +56,7 @@ class Passes:
         """Returns the exit status: 1 where a sum is not the render."""
         from rich.console import Console
 
-        from unirender.files import new_folder
+        from unirender.new_folders import new_folder
 
         if self.resolution < 8 or self.spp < 8 or self.object < 0:
             raise UsageError(

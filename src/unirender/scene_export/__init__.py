@@ -34,8 +34,9 @@ from types import MappingProxyType
 from typing import Any
 
 from unirender.arguments import check_switches
-from unirender.files import new_folder, write_meta
+from unirender.files import write_meta
 from unirender.intrinsics import Intrinsics
+from unirender.new_folders import new_folder
 from unirender.scene_export.card import Card
 from unirender.scene_export.gltf import write_gltf
 from unirender.scene_export.mitsuba_scene import write_mitsuba
@@ -63,7 +64,7 @@ def write_scene(folder: Path, intrinsics: Intrinsics, meta: Mapping[str, Any] = 
     """Writes the scene into an existing (temporary) folder.
 
     Args:
-        folder: where; see `unirender.files.new_folder`.
+        folder: where; see `unirender.new_folders.new_folder`.
         intrinsics: as in `export_scene`.
         meta: facts on where the maps come from, for `meta.json`.
 
