@@ -18,8 +18,7 @@ from unirender.camera import Camera
 from unirender.diffusion.sampling import Generators, Progress, StepEnd, denoise, draw_noise
 from unirender.models.conditioning import Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, Encoded
-from unirender.models.packing import TRIPLETS
-from unirender.models.priors import Maps
+from unirender.models.packing import TRIPLETS, Maps
 
 Cameras = Camera | Sequence[Camera] | None
 

@@ -25,8 +25,7 @@ from unirender.diffusion.schedule import add_noise
 from unirender.diffusion.timesteps import Timesteps
 from unirender.models.conditioning import Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
-from unirender.models.packing import TRIPLETS
-from unirender.models.priors import Maps
+from unirender.models.packing import TRIPLETS, Maps
 from unirender.pipelines.rendered_maps import told_derived
 from unirender.training.config import LossConfig
 from unirender.training.losses.consistency import Consistency
