@@ -10,7 +10,7 @@ import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender_evaluation.engine import record_of
 from unirender_evaluation.light_metrics import SHAPE as LIGHT_SHAPE
 from unirender_evaluation.light_metrics import score_light

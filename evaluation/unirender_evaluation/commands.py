@@ -73,7 +73,7 @@ class BenchExport:
     def run(self) -> int:
         """Writes the folder."""
         self.check()
-        from unirender.files import new_folder
+        from unirender.new_folders import new_folder
         from unirender_evaluation.export import export_inputs
         from unirender_evaluation.suites.suite import load_suite
 

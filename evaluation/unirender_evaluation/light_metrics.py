@@ -14,12 +14,8 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import (
-    environment_directions,
-    resample_environment,
-    sample_environment,
-    texel_solid_angles,
-)
+from unirender.light.environment import environment_directions, sample_environment, texel_solid_angles
+from unirender.light.resampling import resample_environment
 from unirender_evaluation import metrics
 from unirender_evaluation.light_balls import ball_values
 from unirender_evaluation.metrics import LOG_EPSILON, LOWER, Metric

@@ -21,7 +21,8 @@ from jaxtyping import Float
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError
 from unirender.exr import Channels, channels_rgb, read_exr_bytes
-from unirender.light.environment import mean_radiance, resample_environment
+from unirender.light.environment import mean_radiance
+from unirender.light.resampling import resample_environment
 from unirender.system.whole_files import replace_file
 from unirender_evaluation.light_metrics import SHAPE
 from unirender_evaluation.metrics import LOG_EPSILON

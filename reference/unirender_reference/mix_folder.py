@@ -209,7 +209,7 @@ def _write(folder: Path, drawn: _Drawn, seed: int, number: int) -> None:
     borrowed = {id(picture.texels) for picture in pictures}
     if any(id(texture.texels) in borrowed for texture in pictures_of(mix)):
         header.append(f"with a picture of {_named(drawn.files[donor])}")
-    temporary = aside(folder, "partial")
+    temporary = aside(folder)
     try:
         with writing(folder):
             temporary.mkdir()

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import as_numbers, as_radiance
-from unirender.light.environment import drawable
+from unirender.light.for_mitsuba import drawable
 from unirender_reference import materials
 from unirender_reference.arrays import aligned
 from unirender_reference.backend import mitsuba
@@ -135,7 +135,7 @@ def envmap_rows(environment: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h
         # Mitsuba resamples smaller maps when it loads them.
         raise UnirenderError(
             f"environment: got shape {environment.shape}, expected (height >= 3, width >= 2, 3); "
-            "move the channels last, or resample it (unirender.light.environment.resample_environment)"
+            "move the channels last, or resample it (unirender.light.resampling.resample_environment)"
         )
     if not np.isfinite(environment).all() or environment.min() < 0:
         raise UnirenderError(

@@ -10,7 +10,6 @@ what it was asked for. An error is one line.
 
 import contextlib
 import functools
-import importlib.metadata
 import logging
 import os
 import signal
@@ -22,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+import unirender
 from unirender.command_line.commands import Decompose, Edit, Relight, Render
 from unirender.command_line.parse import parse
 from unirender.command_line.process_ends import (
@@ -78,7 +78,6 @@ class Doctor:
         from rich.table import Table
         from rich.text import Text
 
-        import unirender
         from unirender.models.precision import resolve_device, resolve_dtype
         from unirender.shipped import shipped_names
         from unirender.system.paths import cache_dir
@@ -222,7 +221,7 @@ def main(argv: list[str] | None = None) -> None:
     logger.addHandler(handler)
     try:
         if arguments == ["--version"]:
-            print(f"unirender {importlib.metadata.version('unirender')}", flush=True)
+            print(f"unirender {unirender.__version__}", flush=True)
             sys.exit(0)
         command = parse(Command, arguments, "unirender", "A physics-checked renderer and inverse renderer.")
         with quick_start() if argv is None and isinstance(command, MODEL) else contextlib.nullcontext():

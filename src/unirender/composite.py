@@ -1,8 +1,9 @@
 """The closed-form image of an `Intrinsics`: what the paper's s and d give without tracing a ray.
 
+    L(x, v) = integral of f(x, v, l) E(x, l) max(n . l, 0) dl                          (Eq. 1)
     I = (1 - metallic) * albedo * d + F(albedo, metallic) * s,    F = 0.04 * (1 - metallic) + albedo * metallic
 
-It stands for the rendering equation (paper Eq. 1): d and s are its integral over the light for two surfaces that know
+I stands for L, the paper's rendering equation: d and s are its integral over the light for two surfaces that know
 neither albedo nor metallic, which weigh them here. It leaves out interreflection, the angle in the Fresnel term and the
 retro-reflection of the principled diffuse lobe: about 4 % of a pixel's radiance. The functions are plain arithmetic and
 take numpy arrays and torch tensors alike, as long as single-channel maps broadcast against three-channel ones.

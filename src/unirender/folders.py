@@ -15,15 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.files import (
-    ENVIRONMENT_FILE,
-    INTRINSICS_FILE,
-    META_FILE,
-    SUMMARY_FILE,
-    new_folder,
-    write_result,
-)
+from unirender.files import ENVIRONMENT_FILE, INTRINSICS_FILE, write_result
 from unirender.intrinsics import MAPS
+from unirender.new_folders import META_FILE, SUMMARY_FILE, new_folder
 from unirender.picture_files.display_files import RAW_SUFFIXES
 from unirender.pictures import Picture, checked_file
 from unirender.system.paths import forget_half_made

@@ -8,12 +8,8 @@ from reference_scenes import environment
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import (
-    environment_directions,
-    resample_environment,
-    rotate_environment,
-    texel_solid_angles,
-)
+from unirender.light.environment import environment_directions, rotate_environment, texel_solid_angles
+from unirender.light.resampling import resample_environment
 from unirender_evaluation import metrics
 from unirender_evaluation.light_balls import ball_values
 from unirender_evaluation.light_metrics import (

@@ -15,7 +15,8 @@ from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import exr_bytes, image_channels, write_environment, write_exr
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import environment_directions, mean_radiance, resample_environment
+from unirender.light.environment import environment_directions, mean_radiance
+from unirender.light.resampling import resample_environment
 from unirender_evaluation.bounds import TRUE_LIGHT, ceiling_jobs
 from unirender_evaluation.claims import light_claims
 from unirender_evaluation.engine import answer, score

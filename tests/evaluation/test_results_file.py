@@ -147,11 +147,11 @@ def definition(kind: str, name: str, what: Any) -> Callable[[dict[str, Any]], No
 
 
 CONTRADICTIONS = {
-    "row": (record(0, method="ours-men"), r"records\[0\].method: no row 'ours-men', did you mean 'ours-mean'\?"),
-    "table": (record(0, table="invers"), r"records\[0\].table: no table 'invers', did you mean 'inverse'\?"),
-    "protocol": (record(0, protocol="given"), "table 'inverse' has no protocol 'given', expected one of single-image"),
+    "row": (record(0, method="ours-men"), r"records\[0\].method: no row 'ours-men'; did you mean ours-mean\?"),
+    "table": (record(0, table="invers"), r"records\[0\].table: no table 'invers'; did you mean inverse\?"),
+    "protocol": (record(0, protocol="given"), "table 'inverse' has no protocol 'given'; expected one of single-image"),
     "no value": (record(0, values={}), r"records\[0\].values: is empty"),
-    "metric": (value("albedo.psnrr@masked-srgb-raw", 1), "no metric 'psnrr', did you mean 'psnr'"),
+    "metric": (value("albedo.psnrr@masked-srgb-raw", 1), "no metric 'psnrr'; did you mean psnr"),
     "no variant": (value("albedo.psnr", 1), r"got the key 'albedo.psnr', expected albedo.psnr@\(masked\|whole\)-"),
     "too many": (value("normal.cosine@masked", 1), "expected normal.cosine without a variant"),
     "order": (value("albedo.psnr@srgb-masked-raw", 1), "expected albedo.psnr@"),
@@ -211,7 +211,7 @@ def test_a_reader_hears_of_a_partial_run_and_of_values_that_no_table_shows() -> 
     assert told == [
         "a partial run (--limit 2): its tables carry a watermark",
         "described, but without a value: noise-ceiling",
-        "quantity 'albdo' stands in no table (1 values), did you mean 'albedo'?",
+        "quantity 'albdo' stands in no table (1 values); did you mean albedo?",
     ]
 
 

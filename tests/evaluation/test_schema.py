@@ -47,7 +47,7 @@ def changed(*path: Any, to: Any = ..., drop: bool = False) -> Callable[[dict[str
 PSNR = "albedo.psnr@masked-srgb-raw"
 BROKEN = {
     "unknown field": (changed("run", "mask", to=1), "run: unknown field 'mask'"),
-    "misspelt": (changed("run", "coverag", to=0.1), "did you mean 'coverage'?"),
+    "misspelt": (changed("run", "coverag", to=0.1), "did you mean coverage?"),
     "missing": (changed("run", "suite_hash", drop=True), "run: field 'suite_hash' is missing, expected a string (the"),
     "missing part": (changed("records", drop=True), "field 'records' is missing, expected a list"),
     "hash": (changed("run", "suite_hash", to="abc"), "run.suite_hash: got 'abc', expected a string (the sha256 of"),

@@ -82,9 +82,9 @@ def counted_rows(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     rows: list[int] = []
     forward = DualStreamModel.forward
 
-    def counted(self: DualStreamModel, *args: Any, **kwargs: Any) -> Any:
-        rows.append(len(args[0]))
-        return forward(self, *args, **kwargs)
+    def counted(self: DualStreamModel, attributes: Any, *args: Any, **kwargs: Any) -> Any:
+        rows.append(len(attributes))
+        return forward(self, attributes, *args, **kwargs)
 
     monkeypatch.setattr(DualStreamModel, "forward", counted)
     return rows

@@ -8,7 +8,7 @@ from unirender.composite import split_sum_image
 from unirender.intrinsics import Intrinsics
 from unirender.pipelines import bounced_light
 from unirender.pipelines.derived_light import derived_light
-from unirender.pipelines.inputs import ready_to_render
+from unirender.pipelines.rendered_maps import ready_to_render
 from unirender.pipelines.shadowed_light import visible_shares
 from unirender_reference.lights import make_light
 from unirender_reference.render import Sample, SceneSpec, render_sample

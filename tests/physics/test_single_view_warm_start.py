@@ -7,7 +7,7 @@ from unirender import UniRenderPipeline
 from unirender.camera import Camera
 from unirender.color import image_srgb, unpremultiply
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender_reference.lights import make_light
 from unirender_reference.optimize.single.config import SingleConfig
 from unirender_reference.optimize.single.run import optimize_image

@@ -13,10 +13,11 @@ from unirender.camera import Camera
 from unirender.cli import read_light
 from unirender.errors import UnirenderError
 from unirender.exr import image_channels, on_pole_grid, read_exr, write_environment, write_exr
-from unirender.files import new_folder, write_result
+from unirender.files import write_result
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender.light.surface_light import diffuse_light, specular_light
+from unirender.new_folders import new_folder
 from unirender_reference.lights import load_light
 from unirender_reference.lights.files import BYTES_A_TEXEL, BYTES_OF_NONE
 from unirender_reference.lights.light import area_resampled

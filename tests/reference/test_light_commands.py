@@ -10,7 +10,7 @@ from PIL import Image
 from unirender.color import eight_bits
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import on_pole_grid, read_exr
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender_reference import lights
 from unirender_reference.lights.summary import light_row
 from unirender_reference.measure.exposure import Exposure, picture_exposure

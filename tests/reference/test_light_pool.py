@@ -11,7 +11,7 @@ from PIL import Image
 
 from unirender.errors import UnirenderError
 from unirender.exr import write_environment
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender_reference import lights
 from unirender_reference.lights.draw import SHARES
 from unirender_reference.lights.pool import TRIES, divide

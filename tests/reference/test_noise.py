@@ -282,7 +282,7 @@ def test_images_are_drawn_until_enough_are_measured_or_none_is_left(
         assert count == min(workers, 3)  # no more than images
         return Here()
 
-    monkeypatch.setattr(noise_floor, "WorkerPool", pool)
+    monkeypatch.setattr("unirender.system.worker_pool.WorkerPool", pool)
     monkeypatch.setattr(
         noise_floor, "measure_floor", lambda job: measured_row(job.number, 45, 45 if job.number in reaching else None)
     )

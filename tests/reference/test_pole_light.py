@@ -5,7 +5,8 @@ import pytest
 import reference_scenes as scenes
 import torch
 
-from unirender.light.environment import environment_directions, has_bright_pole, sample_environment, texel_solid_angles
+from unirender.light.environment import environment_directions, sample_environment, texel_solid_angles
+from unirender.light.for_mitsuba import has_bright_pole
 from unirender_reference import principled
 from unirender_reference.lights import bundled_lights, make_light
 from unirender_reference.render import Renderer

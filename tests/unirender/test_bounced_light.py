@@ -11,7 +11,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.pipelines.bounced_light import AROUND, REFLECTED, WHITE_SKY, _mean_radiance, bounced_light
 from unirender.pipelines.derived_light import derived_light
 from unirender.pipelines.editing import under_light
-from unirender.pipelines.inputs import ready_to_render
+from unirender.pipelines.rendered_maps import ready_to_render
 from unirender.pipelines.shadowed_light import visible_shares
 
 LIGHT = ("specular", "diffuse")

@@ -16,8 +16,9 @@ from webdataset.compat import WebDataset
 
 from unirender.composite import composite_image
 from unirender.errors import UnirenderError
-from unirender.light.environment import mean_radiance, resample_environment, rotate_environment
+from unirender.light.environment import mean_radiance, rotate_environment
 from unirender.light.exposure import PERCENTILE, TARGET_RANGE, exposure_factor
+from unirender.light.resampling import resample_environment
 from unirender.light.surface_light import diffuse_light, specular_light
 from unirender.light.symmetries import turn_rotation
 from unirender.system.paths import cache_dir

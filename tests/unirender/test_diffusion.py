@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from unirender.diffusion.sampling import MOST_STEPS, draw_noise, make_sampler, set_timesteps, steps_of
+from unirender.diffusion.samplers import make_sampler
+from unirender.diffusion.sampling import draw_noise, set_timesteps
 from unirender.diffusion.schedule import add_noise, last_timestep, make_scheduler, zero_terminal_betas
+from unirender.diffusion.steps import MOST_STEPS, steps_of
 from unirender.diffusion.timesteps import algorithm1_timesteps, conditional_timesteps, draw_timesteps
 from unirender.errors import UnirenderError
 

@@ -17,8 +17,9 @@ from unirender.camera import Camera
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import image_channels, intrinsics_channels, on_pole_grid, read_exr, write_environment, write_exr
-from unirender.files import new_folder, read_result, write_result
+from unirender.files import read_result, write_result
 from unirender.intrinsics import Intrinsics
+from unirender.new_folders import new_folder
 from unirender.pictures import read_picture
 from unirender.shipped import checkpoint_sha256
 from unirender.system.whole_files import replace_file, whole_file

@@ -14,7 +14,7 @@ from PIL import Image
 
 from unirender.command_line.input_picture import read_input
 from unirender.errors import UnirenderError, UsageError
-from unirender.files import new_folder, write_result
+from unirender.files import write_result
 from unirender.folders import (
     AT_ONCE,
     FolderResult,
@@ -27,6 +27,7 @@ from unirender.folders import (
 )
 from unirender.frames import FilmFrame, temporal_difference
 from unirender.intrinsics import Intrinsics
+from unirender.new_folders import new_folder
 from unirender.pictures import Picture
 from unirender.pipelines.results import Decomposition
 from unirender.visualization import map_picture

@@ -7,15 +7,14 @@ import pytest
 from environments import random_directions, smooth_environment
 
 from unirender.light.environment import (
-    area_pixels,
     environment_directions,
     mean_radiance,
     mirror_environment,
-    resample_environment,
     rotate_environment,
     sample_environment,
     texel_solid_angles,
 )
+from unirender.light.resampling import area_pixels, resample_environment
 
 RNG = np.random.default_rng(3)
 

@@ -242,22 +242,22 @@ def test_the_cycle_asks_the_network_what_a_rendering_asks_it(monkeypatch: pytest
         monkeypatch.setattr(module, name, lambda x, *others: torch.zeros(x if isinstance(x, tuple) else x.shape))
     loss, batch = loss_function(), make_batch()
     attributes = loss.conditioning.encode_attributes(batch)
-    clean_i, given = loss.conditioning.encode_image(batch["image"]), torch.ones(4, len(TRIPLETS), dtype=torch.bool)
-    asked: list[list[Tensor]] = []
+    i_0, given = loss.conditioning.encode_image(batch["image"]), torch.ones(4, len(TRIPLETS), dtype=torch.bool)
+    asked: list[dict[str, Tensor]] = []
     forward = loss.model.forward
 
-    def record(*args: Any, **kwargs: Any) -> DualStreamOutput:
-        asked.append([x for x in (*args, kwargs["image_prior"]) if isinstance(x, Tensor)])
-        return forward(*args, **kwargs)
+    def record(**inputs: Any) -> DualStreamOutput:
+        asked.append({name: x for name, x in inputs.items() if isinstance(x, Tensor)})
+        return forward(**inputs)
 
     monkeypatch.setattr(loss.model, "forward", record)
-    consistency(loss).cycle(attributes, clean_i, batch["mask"], generator())
+    consistency(loss).cycle(attributes, i_0, batch["mask"], generator())
     maps = loss.conditioning.decode_attributes(attributes)
     inference.infer_image(loss.model, loss.conditioning, loss.scheduler, maps, given)
     in_training, in_use = asked
     assert len(in_training) == len(in_use) == 7  # both streams and their timesteps, the extras of both, the prior
-    for one, other in zip(in_training, in_use, strict=True):
-        torch.testing.assert_close(one.detach(), other, rtol=0, atol=1e-4)
+    for name, x in in_training.items():
+        torch.testing.assert_close(x.detach(), in_use[name], rtol=0, atol=1e-4)
 
 
 def test_under_autocast_the_cycle_has_the_same_gradients() -> None:

@@ -9,7 +9,8 @@ from synthetic_shards import own_picture
 from torch import Tensor
 
 from unirender.errors import UnirenderError
-from unirender.light.environment import mean_radiance, resample_environment, rotate_environment
+from unirender.light.environment import mean_radiance, rotate_environment
+from unirender.light.resampling import resample_environment
 from unirender.light.surface_light import diffuse_light
 from unirender.light.symmetries import quarter_turn
 from unirender.training.augmentations.augment import to_maps

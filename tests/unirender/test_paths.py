@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from unirender.errors import UnirenderError
-from unirender.files import new_folder
+from unirender.new_folders import new_folder
 from unirender.system.paths import cache_dir, cached_folder
 from unirender.system.whole_files import replace_file
 from unirender_evaluation.suites.truth_file import write_tar

@@ -15,10 +15,10 @@ from tiny_models import SIZE, counted_rows, make_pipeline
 
 from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode
-from unirender.command_line.options import MOST_STEPS, DecompositionOptions
+from unirender.command_line.options import DecompositionOptions
 from unirender.composite import split_sum_image
-from unirender.diffusion import sampling
 from unirender.diffusion.schedule import NUM_TIMESTEPS
+from unirender.diffusion.steps import MOST_STEPS
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
@@ -539,6 +539,6 @@ def test_the_folder_of_a_run_names_its_pipeline(tmp_path: Path) -> None:
 
 
 def test_more_steps_than_timesteps_are_refused() -> None:
-    assert MOST_STEPS == sampling.MOST_STEPS < NUM_TIMESTEPS
+    assert MOST_STEPS < NUM_TIMESTEPS
     with pytest.raises(UnirenderError, match="num_inference_steps: got 501, expected 1 to 500"):
         make_pipeline().decompose(*picture(), mode="sample", num_inference_steps=MOST_STEPS + 1)

@@ -15,7 +15,7 @@ from unirender.pipelines import derived_light
 from unirender.pipelines.derived_light import COARSE_ROWS, LIGHT_SIDE, derived_diffuse, derived_specular
 from unirender.pipelines.editing import specular_for_roughness, specular_share, trust, under_light
 from unirender.pipelines.framing import Frame
-from unirender.pipelines.inputs import ready_to_render
+from unirender.pipelines.rendered_maps import ready_to_render
 from unirender.pipelines.revealed_light import agreeing_light
 from unirender.pipelines.shadowed_light import visible_shares
 

@@ -8,9 +8,10 @@ from scipy.ndimage import gaussian_filter
 
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import environment_directions, resample_environment
+from unirender.light.environment import environment_directions
 from unirender.light.ggx import facing_normal
 from unirender.light.lobes import cosine_matrix, grid_lobes, lobe_matrix
+from unirender.light.resampling import resample_environment
 from unirender.pipelines.derived_light import derived_diffuse, derived_specular
 from unirender.pipelines.revealed_light import agreeing_light, revealed_light
 

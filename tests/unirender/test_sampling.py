@@ -17,14 +17,10 @@ from torch import Tensor
 from unirender.camera import Camera
 from unirender.diffusion import sampling
 from unirender.diffusion.inference import extras_by_camera, infer_attributes, infer_image
-from unirender.diffusion.sampling import (
-    MOST_STEPS,
-    check_scheduler,
-    denoise,
-    draw_noise,
-    make_sampler,
-)
+from unirender.diffusion.samplers import check_scheduler, make_sampler
+from unirender.diffusion.sampling import denoise, draw_noise
 from unirender.diffusion.schedule import last_timestep, make_scheduler
+from unirender.diffusion.steps import MOST_STEPS
 from unirender.errors import UnirenderError
 from unirender.models.conditioning import Conditioning
 from unirender.models.dual_stream import DualStreamModel

@@ -14,8 +14,8 @@ from unirender.cli import main
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError, UsageError
 from unirender.exr import channels_rgb, read_exr
-from unirender.files import folder_beside, new_folder
 from unirender.intrinsics import Intrinsics
+from unirender.new_folders import folder_beside, new_folder
 from unirender.scene_export import export_scene
 from unirender.scene_export.card import Card
 from unirender.scene_export.gltf import document

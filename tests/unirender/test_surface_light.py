@@ -9,13 +9,9 @@ from environments import random_directions, smooth_environment
 from unirender.camera import Camera
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError
-from unirender.light.environment import (
-    environment_directions,
-    resample_environment,
-    sample_environment,
-    texel_solid_angles,
-)
+from unirender.light.environment import environment_directions, sample_environment, texel_solid_angles
 from unirender.light.lobes import lobe_matrix
+from unirender.light.resampling import resample_environment
 from unirender.light.surface_light import SHARP_ROUGHNESS, diffuse_light, lobe_light, specular_light
 
 RNG = np.random.default_rng(4)

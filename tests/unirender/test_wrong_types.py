@@ -23,7 +23,9 @@ from unirender.files import map_picture, read_result, write_png, write_result
 from unirender.intrinsics import Intrinsics
 from unirender.pictures import Picture, read_picture
 from PIL import Image
-from unirender.light.environment import has_bright_pole, resample_environment, rotate_environment, sample_environment
+from unirender.light.environment import rotate_environment, sample_environment
+from unirender.light.for_mitsuba import has_bright_pole
+from unirender.light.resampling import resample_environment
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.scene_export import export_scene
 from unirender.light.surface_light import diffuse_light, specular_light

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from unirender.color import image_srgb
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender_evaluation.demo.session import Check, Subject, View
 from unirender_evaluation.report.gallery import data_uri, image_picture, map_pictures
 

@@ -21,7 +21,7 @@ from PIL import Image
 
 from unirender.command_line.input_picture import read_input
 from unirender.errors import UnirenderError
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender.pictures import Picture
 from unirender_evaluation.figures.pictures import framed
 from unirender_reference.lights import load_light

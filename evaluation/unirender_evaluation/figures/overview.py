@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender.visualization import map_picture
 from unirender_evaluation.figures.grid import Grid, Line, Tile, over_white
 from unirender_evaluation.figures.panels import Subject, able, input_tile, picture_over_white

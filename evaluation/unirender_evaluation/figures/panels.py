@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from unirender.color import image_srgb, srgb_encode
 from unirender.errors import UnirenderError
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender.visualization import map_picture
 from unirender_evaluation.engine import answer, answered, ask
 from unirender_evaluation.figures.grid import Grid, Line, Tile

@@ -59,7 +59,7 @@ class ShadowedSplitSum:
     config: Mapping[str, Any] = MappingProxyType({"composite": "split-sum", "shadows": "seen"})
 
     def render(self, intrinsics: Intrinsics) -> Image:
-        from unirender.pipelines.inputs import ready_to_render
+        from unirender.pipelines.rendered_maps import ready_to_render
 
         return split_sum_image(ready_to_render(intrinsics, shadows=True))
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from unirender.color import srgb_decode, srgb_encode
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender_evaluation import metrics
 from unirender_evaluation.light_metrics import DIMMEST, SHAPE, scaled_log_rmse
 from unirender_evaluation.methods.method import Mask

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.exr import MAP_CHANNELS
+from unirender.system.wording import counted
 from unirender_evaluation.methods.method import Mask
 from unirender_evaluation.predictions.conventions import FILE, Conventions
 from unirender_evaluation.predictions.folder import LIGHT_FILES, MAP_FILES, SUFFIXES, PredictionFolder
@@ -44,7 +45,7 @@ class PredictionError(UnirenderError):
     """Folders of predictions that cannot be scored; `problems` has a line for each reason."""
 
     def __init__(self, problems: list[str]) -> None:
-        count = f"{len(problems)} problem{'' if len(problems) == 1 else 's'}"
+        count = counted(len(problems), "problem")
         super().__init__("\n".join([f"predictions: {count}, nothing was run", *_shortened(problems)]))
         self.problems = tuple(problems)
 

@@ -21,6 +21,7 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
 from unirender.picture_files.display_files import srgb_values, stored_values
 from unirender.system.whole_files import file_sha256
+from unirender.system.wording import counted
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.tables.specs import TableSpec
@@ -38,7 +39,7 @@ class PublicSetError(UnirenderError):
     def __init__(self, name: str, problems: Sequence[str]) -> None:
         shown = list(problems[:MOST_PROBLEMS])
         more = [f"and {len(problems) - len(shown)} more"] if len(problems) > len(shown) else []
-        count = f"{len(problems)} problem{'' if len(problems) == 1 else 's'}"
+        count = counted(len(problems), "problem")
         super().__init__("\n".join([f"{name}: {count}, nothing was run", *shown, *more]))
         self.problems = tuple(problems)
 

@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UnirenderError
+from unirender.system.wording import instead
 from unirender_evaluation.metrics import MASKS, OWN_MASK, SCALES, SPACES
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.results.data import Results, metric_definition, metric_name, protocol_definition
-from unirender_evaluation.results.schema_check import Problem, did_you_mean
+from unirender_evaluation.results.schema_check import Problem
 from unirender_evaluation.table_list import ALL_METRICS, ALL_TABLES
 from unirender_evaluation.tables.published import check_name
 from unirender_evaluation.tables.specs import PROTOCOLS
@@ -63,7 +64,7 @@ def remarks(results: Results) -> list[str]:
     shown = {column.quantity for spec in ALL_TABLES.values() for column in spec.columns} | set(UNSHOWN)
     quantities = Counter(key.partition(".")[0] for record in results.records for key in record.values)
     for name in sorted(q for q in quantities if q not in shown and VIEW.sub("", q) not in shown):
-        found.append(f"quantity {name!r} stands in no table ({quantities[name]} values){did_you_mean(name, shown)}")
+        found.append(f"quantity {name!r} stands in no table ({quantities[name]} values){instead(name, shown)}")
     here = installed_suite_hash(run.suite)
     if here not in (None, run.suite_hash):
         found.append(
@@ -111,7 +112,7 @@ def _method_problems(results: Results) -> Iterator[Problem]:
                 yield Problem(f"{place}.published", str(error))
     yield from _gathered(
         results.records,
-        lambda r: [] if r.method in keys else [(".method", f"no row {r.method!r}{did_you_mean(r.method, keys)}")],
+        lambda r: [] if r.method in keys else [(".method", f"no row {r.method!r}{instead(r.method, keys)}")],
     )
 
 
@@ -138,9 +139,9 @@ def _definition_problems(results: Results) -> Iterator[Problem]:
 def _record_problems(record: Record) -> Iterator[tuple[str, str]]:
     spec = ALL_TABLES.get(record.table)
     if spec is None:
-        yield ".table", f"no table {record.table!r}{did_you_mean(record.table, ALL_TABLES)}"
+        yield ".table", f"no table {record.table!r}{instead(record.table, ALL_TABLES)}"
     elif record.protocol not in spec.protocols:
-        asked = did_you_mean(record.protocol, spec.protocols)
+        asked = instead(record.protocol, spec.protocols)
         yield ".protocol", f"table {record.table!r} has no protocol {record.protocol!r}{asked}"
     if not record.values:
         yield ".values", "is empty: leave a record without values out"
@@ -189,7 +190,7 @@ def _key_problem(key: str, backbones: Iterable[str]) -> str:
     """What is wrong with a metric key; empty where nothing is."""
     name = metric_name(key)
     if name not in ALL_METRICS:
-        return f"no metric {name!r}{did_you_mean(name, ALL_METRICS)}"
+        return f"no metric {name!r}{instead(name, ALL_METRICS)}"
     axes, words = ALL_METRICS[name].axes, [word for word in key.partition("@")[2].split("-") if word]
     if len(words) != len(axes) or any(word not in WORDS[axis] for word, axis in zip(words, axes, strict=True)):
         wanted = "-".join(f"({'|'.join(WORDS[axis])})" for axis in axes)

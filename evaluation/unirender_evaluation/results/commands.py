@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.wording import counted, instead
 
 if TYPE_CHECKING:
     from unirender_evaluation.metrics import Variant
@@ -108,12 +109,11 @@ def rows_of(run: "RunInfo", records: "Sequence[Record]", methods: Sequence[str])
     Raises:
         UsageError: there is no such row.
     """
-    from unirender_evaluation.results.schema_check import did_you_mean
 
     keys = [info.key for info in run.methods]
     for name in methods:
         if name not in keys:
-            raise UsageError(f"--method {name}: no such row{did_you_mean(name, keys)}")
+            raise UsageError(f"--method {name}: no such row{instead(name, keys)}")
     if not methods:
         return run, records
     kept = tuple(info for info in run.methods if info.key in methods)
@@ -127,16 +127,15 @@ def asked_specs(tables: Sequence[str], metrics: Sequence[str]) -> "dict[str, Tab
     Raises:
         UsageError: there is no such table, or no column of any table has such a metric.
     """
-    from unirender_evaluation.results.schema_check import did_you_mean
     from unirender_evaluation.table_list import ALL_TABLES
 
     for name in tables:
         if name not in ALL_TABLES:
-            raise UsageError(f"--table {name}: no such table{did_you_mean(name, ALL_TABLES)}")
+            raise UsageError(f"--table {name}: no such table{instead(name, ALL_TABLES)}")
     known = dict.fromkeys(column.metric.name for each in ALL_TABLES.values() for column in each.columns)
     for name in metrics:
         if name not in known:
-            raise UsageError(f"--metric {name}: no column has that metric{did_you_mean(name, known)}")
+            raise UsageError(f"--metric {name}: no column has that metric{instead(name, known)}")
     specs = {}
     for name in tables or ALL_TABLES:
         spec = ALL_TABLES[name]
@@ -264,7 +263,7 @@ def _validate(path: Path) -> int:
         print(f"not valid: {error}")
         return 1
     if results is None or problems:
-        print(f"{path}: not valid, {len(problems)} problem{'s' if len(problems) > 1 else ''}")
+        print(f"{path}: not valid, {counted(len(problems), 'problem')}")
         print("\n".join(f"  {problem}" for problem in problems))
         return 1
     run = results.run

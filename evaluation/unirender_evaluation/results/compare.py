@@ -4,12 +4,12 @@ Every column of every table under every protocol that both rows answered: both m
 the difference A - B with its paired interval over objects, the verdict, and each row's rank in its own run.
 """
 
-import difflib
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.system.wording import meant, near
 from unirender_evaluation.comparisons import (
     Comparison,
     Lights,
@@ -221,9 +221,8 @@ def _row(run: RunInfo, key: str, file: str) -> MethodInfo:
     found = next((info for info in run.methods if info.key == key), None)
     if found is None:
         known = [info.key for info in run.methods]
-        close = difflib.get_close_matches(key, known, 1)
-        hint = f"did you mean {close[0]}?" if close else f"it has {_keys(run)}"
-        raise UnirenderError(f"compare: {file} has no row {key!r}; {hint}")
+        hint = meant(near(key, known)) or f"; it has {_keys(run)}"
+        raise UnirenderError(f"compare: {file} has no row {key!r}{hint}")
     return found
 
 

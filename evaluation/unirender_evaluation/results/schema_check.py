@@ -4,13 +4,14 @@ Understands the keywords that `schema.json_schema` uses, no others: an unknown o
 check that is silently left out.
 """
 
-import difflib
 import functools
 import itertools
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
+
+from unirender.system.wording import instead
 
 KEYWORDS = {
     *("$ref", "type", "enum", "const", "anyOf", "pattern", "minLength", "minimum", "maximum"),
@@ -142,7 +143,7 @@ def _check_object(value: dict[str, Any], rule: Rule, place: str) -> Iterator[Pro
             if not _is_done(item, known[name]):
                 yield from _check(item, known[name], f"{place}.{name}" if place else name)
         elif others is None:
-            yield Problem(place, f"unknown field {name!r}{did_you_mean(name, known)}")
+            yield Problem(place, f"unknown field {name!r}{instead(name, known)}")
         else:
             if not _matches(pattern, name):
                 yield Problem(place, f"got the name {name!r}, expected {expected(rule.schema)}")
@@ -186,10 +187,3 @@ def quoted(value: Any) -> str:
     """A value as an error message shows it."""
     text = repr(value)
     return text if len(text) <= LONG else f"{text[:LONG]}…"
-
-
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """A suggestion, whatever the case of its letters, or the names that there are."""
-    names = {each.casefold(): each for each in known}
-    close = difflib.get_close_matches(name.casefold(), names, 1)
-    return f", did you mean {names[close[0]]!r}?" if close else f", expected one of {', '.join(names.values())}"

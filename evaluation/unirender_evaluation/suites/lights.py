@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender.system.whole_files import file_sha256
 from unirender_evaluation.suites.objects import drawn, missing_folder
 from unirender_evaluation.suites.spec import SuiteSpec

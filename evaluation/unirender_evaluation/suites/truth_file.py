@@ -140,7 +140,7 @@ class Stored:
 
 def write_tar(path: Path, members: Mapping[str, bytes] | Mapping[str, bytes | Stored]) -> None:
     """Writes a reproducible tar (sorted, no times or owners), moved into place when complete."""
-    temporary = aside(path, "partial")
+    temporary = aside(path)
     try:
         with temporary.open("xb") as stream:
             with tarfile.open(fileobj=stream, mode="w") as tar:

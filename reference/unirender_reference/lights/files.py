@@ -14,7 +14,8 @@ from unirender.arguments import as_path, check_switches
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, on_pole_grid, pixel_count, read_exr
-from unirender.light.environment import check_shape, is_twice_as_wide, resample_environment
+from unirender.light.environment import check_shape, is_twice_as_wide
+from unirender.light.resampling import resample_environment
 from unirender.picture_files import display_files
 from unirender.pictures import check_finite, negative_share
 from unirender.system.machine import memory_excess

@@ -15,7 +15,8 @@ from jaxtyping import Float
 from unirender.color import luminance
 from unirender.errors import UnirenderError
 from unirender.intrinsics import check_radiance
-from unirender.light.environment import check_shape, hat_weights, mean_radiance, weighted_means
+from unirender.light.environment import check_shape, mean_radiance
+from unirender.light.resampling import hat_weights, weighted_means
 from unirender.shown import short_repr
 
 if TYPE_CHECKING:

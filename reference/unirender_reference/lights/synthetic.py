@@ -4,7 +4,8 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.errors import UnirenderError
-from unirender.light.environment import environment_directions, resample_environment
+from unirender.light.environment import environment_directions
+from unirender.light.resampling import resample_environment
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights.light import SHAPE, Light, normalized
 from unirender_reference.lights.placement import random_turn

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.color import luminance
-from unirender.light.environment import resample_environment, texel_solid_angles
+from unirender.light.environment import texel_solid_angles
+from unirender.light.resampling import resample_environment
 from unirender_reference.lights.light import SHAPE, Light, normalized
 
 SAME_PLACE = 0.5  # likeness from which two maps are taken for one place

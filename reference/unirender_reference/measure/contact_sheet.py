@@ -95,7 +95,7 @@ def buffer_tiles(sample: "Sample") -> "list[np.ndarray]":
     import numpy as np
 
     from unirender.color import image_srgb, srgb_decode
-    from unirender.light.environment import resample_environment
+    from unirender.light.resampling import resample_environment
     from unirender_reference.sheets import BACKGROUND, environment_preview
 
     maps = sample.intrinsics.maps

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 from unirender.errors import UsageError
 from unirender.system.wording import counted
-from unirender.system.worker_pool import WorkerPool
 from unirender_reference.option_checks import require_least
 
 if TYPE_CHECKING:
@@ -46,6 +45,7 @@ class Cost:
         from rich.console import Console
         from rich.table import Table
 
+        from unirender.system.worker_pool import WorkerPool
         from unirender_reference.plan import SHARD_GROUPS
 
         require_least(self, "", {"spp": 1, "scenes": 1, "objects": 1})

@@ -214,7 +214,7 @@ def _export(folder: Path, light: "Light") -> None:
 
 def _sheet(lights: "list[tuple[Split, Light]]") -> "Image.Image":
     """Thumbnails of the lights, each over its name, split and what it is."""
-    from unirender.light.environment import resample_environment
+    from unirender.light.resampling import resample_environment
     from unirender_reference.lights.summary import about
     from unirender_reference.sheets import captioned_sheet, environment_preview
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from unirender.errors import UsageError
-from unirender.system.worker_pool import WorkerPool
 from unirender_reference.measure.size import check_size
 from unirender_reference.option_checks import require_least
 from unirender_reference.processes import start_worker
@@ -166,6 +165,8 @@ class NoiseFloor:
     def _rows(self) -> Iterator[FloorRow]:
         """Rows in the order of their numbers, until enough are measured or all candidates have been tried."""
         from concurrent.futures import Future
+
+        from unirender.system.worker_pool import WorkerPool
 
         workers = min(self.workers or os.cpu_count() or 1, self.images)
         jobs = (

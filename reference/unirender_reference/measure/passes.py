@@ -57,7 +57,7 @@ class Passes:
         """Returns the exit status: 1 where a sum is not the render."""
         from rich.console import Console
 
-        from unirender.files import new_folder
+        from unirender.new_folders import new_folder
 
         require_least(self, "", {"resolution": 8, "spp": 8, "object": 0})
         for name, value in (("roughness", self.roughness), ("metallic", self.metallic)):

@@ -5,7 +5,6 @@ missing light (shadows, interreflection) and averaging (highlights narrower than
 whose predictions are shaded again (closed loop) cannot be expected to score better.
 """
 
-import statistics
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +35,8 @@ class ShadeCeiling:
 
     def run(self) -> int:
         """Measures and prints; returns the exit status."""
+        from statistics import fmean
+
         from rich.console import Console
         from rich.table import Table
 
@@ -50,7 +51,7 @@ class ShadeCeiling:
         for metallic in self.metallic:
             for roughness in self.roughness:
                 scores = [cell[roughness, metallic] for cell in cells]
-                means = (statistics.fmean(score[mode] for score in scores) for mode in MODES)
+                means = (fmean(score[mode] for score in scores) for mode in MODES)
                 least = min(score["floor"] for score in scores)
                 table.add_row(f"{metallic:g}", f"{roughness:g}", *(f"{mean:.1f}" for mean in means), f"{least:.1f}")
             table.add_section()

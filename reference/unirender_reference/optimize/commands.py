@@ -208,7 +208,8 @@ class Optimize:
         """Optimises one picture and writes a result folder; the exit status."""
         from rich.console import Console
 
-        from unirender.files import new_folder, write_result
+        from unirender.files import write_result
+        from unirender.new_folders import new_folder
         from unirender_reference.optimize.files.state import history_line
         from unirender_reference.optimize.show.live import live_report
         from unirender_reference.optimize.show.report import Report

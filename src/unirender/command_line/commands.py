@@ -73,8 +73,8 @@ class Decompose:
 
     def run(self) -> int:
         """Returns the exit status."""
-        from unirender.files import folder_beside, new_folder
         from unirender.folders import of_picture, write_decomposition
+        from unirender.new_folders import folder_beside, new_folder
         from unirender.scene_export import write_scene
 
         self.model.check()
@@ -123,11 +123,12 @@ class Render:
 
     def run(self, read_light: ReadLight) -> int:
         """Returns the exit status."""
-        from unirender.files import new_folder, read_result, write_result
+        from unirender.files import read_result, write_result
         from unirender.map_edits import with_edits
+        from unirender.new_folders import new_folder
         from unirender.pipelines.edited_light import with_edited_light
         from unirender.pipelines.editing import under_light
-        from unirender.pipelines.inputs import RENDER_NEEDS, ready_to_render, to_derive, told_derived, with_mask
+        from unirender.pipelines.rendered_maps import RENDER_NEEDS, ready_to_render, to_derive, told_derived, with_mask
 
         self.model.check()
         check_stops(self.exposure)
@@ -200,8 +201,8 @@ class Edit:
 
     def run(self) -> int:
         """Returns the exit status."""
-        from unirender.files import new_folder
         from unirender.folders import of_picture
+        from unirender.new_folders import new_folder
 
         self.model.check()
         self.decomposition.check(self.model.mode)
@@ -248,8 +249,8 @@ class Relight:
 
     def run(self, read_light: ReadLight) -> int:
         """Returns the exit status."""
-        from unirender.files import new_folder
         from unirender.folders import of_picture
+        from unirender.new_folders import new_folder
 
         self.model.check()
         self.decomposition.check(self.model.mode)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from unirender.command_line.input_picture import read_input
 from unirender.command_line.remarks import frame_remarks
 from unirender.errors import UnirenderError
-from unirender.files import SUMMARY_FILE
 from unirender.folders import FolderResult, decompose_folder, list_pictures, write_summary
 from unirender.frames import temporal_difference
+from unirender.new_folders import SUMMARY_FILE
 from unirender.pictures import Picture
 from unirender.pipelines.inputs import as_picture
 from unirender.pipelines.results import Decomposition

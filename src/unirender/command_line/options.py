@@ -15,6 +15,7 @@ from unirender.command_line.input_picture import (
     read_input,
 )
 from unirender.command_line.option_checks import at_least, usage
+from unirender.diffusion.steps import MOST_STEPS, steps_of
 from unirender.errors import UsageError
 
 if TYPE_CHECKING:
@@ -28,8 +29,6 @@ Device = Literal["auto", "cpu", "cuda", "mps"]
 DType = Literal["auto", "float32", "bfloat16", "float16"]
 Sampler = Literal["ddim", "unipc"]
 MaterialForm = Literal["scalar", "map"]
-
-MOST_STEPS = 500  # the same as `unirender.diffusion.sampling.MOST_STEPS`, which needs torch
 
 
 @dataclass(frozen=True)
@@ -142,7 +141,7 @@ class ModelOptions:
     def provenance(self, pipeline: "UniRenderPipeline") -> dict[str, Any]:
         """What goes into `meta.json` and the headers: which model ran, and how."""
         import unirender
-        from unirender.diffusion.sampling import sampler_name, steps_of
+        from unirender.diffusion.samplers import sampler_name
         from unirender.shipped import checkpoint_folder, checkpoint_label, checkpoint_sha256
 
         steps = steps_of(self.mode, self.steps)

@@ -106,7 +106,7 @@ def missing_maps(intrinsics: "Intrinsics", new_light: bool) -> dict[str, Any]:
         intrinsics: as they are given.
         new_light: whether a light beside them takes the place of their specular, diffuse and environment.
     """
-    from unirender.pipelines.inputs import DERIVABLE, to_derive, with_mask
+    from unirender.pipelines.rendered_maps import DERIVABLE, to_derive, with_mask
 
     derived = DERIVABLE if new_light else tuple(name for name in DERIVABLE if name in to_derive(intrinsics))
     lit = (*DERIVABLE, "environment") if new_light else derived
@@ -130,7 +130,7 @@ def normals_away(intrinsics: "Intrinsics") -> dict[str, Any]:
     Args:
         intrinsics: with a mask.
     """
-    from unirender.pipelines.inputs import facing_away
+    from unirender.pipelines.rendered_maps import facing_away
 
     if intrinsics.normal is None:  # what needs it says so
         return {}

@@ -1,8 +1,10 @@
 """Both directions of a trained network: p(attributes | image) and p(image | attributes).
 
-They are the two cases of the paper's Eq. 3. The stream that is given is clean (its timestep is 0) and is encoded once;
-the other one is sampled from T downwards (`unirender.diffusion.sampling`), in one step or in many. Gradients flow
-through both, to what is given and to the weights; who needs none calls under `torch.no_grad()`.
+    (t_attributes, t_image) = (0, t~) when rendering, (t~, 0) when inverse             (Eq. 3)
+
+The stream that is given is clean (its timestep is 0) and is encoded once; the other one is sampled from T downwards
+(`unirender.diffusion.sampling`), in one step or in many: t~ is the timestep of the step. Gradients flow through both,
+to what is given and to the weights; who needs none calls under `torch.no_grad()`.
 """
 
 from collections.abc import Sequence
@@ -16,8 +18,7 @@ from unirender.camera import Camera
 from unirender.diffusion.sampling import Generators, Progress, StepEnd, denoise, draw_noise
 from unirender.models.conditioning import Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, Encoded
-from unirender.models.packing import TRIPLETS
-from unirender.models.priors import Maps
+from unirender.models.packing import TRIPLETS, Maps
 
 Cameras = Camera | Sequence[Camera] | None
 
@@ -35,7 +36,7 @@ def infer_attributes(
     progress: Progress = iter,
     step_end: StepEnd | None = None,
 ) -> Maps:
-    """Inverse rendering: p(attributes | image), (t_attributes, t_image) = (t, 0) in Eq. 3.
+    """Inverse rendering: p(attributes | image), with (t_attributes, t_image) = (t~, 0).
 
     Args:
         model: the two streams.
@@ -55,18 +56,18 @@ def infer_attributes(
     image = conditioning.encode_image(image_linear).to(model.dtype)
     given = torch.zeros(len(image), len(TRIPLETS), dtype=torch.bool, device=image.device)
     extras = extras_by_camera(conditioning, mask, given, None, camera).to(image)
-    clean = torch.zeros(len(image), dtype=torch.long, device=image.device)
+    zero = torch.zeros(len(image), dtype=torch.long, device=image.device)
     condition: Tensor | Encoded = image
 
     def predict(x_t: Tensor, t: Tensor) -> Tensor:
         nonlocal condition
         output = model(
-            x_t.to(image),
-            condition,
-            t,
-            clean,
-            extras.attributes,
-            extras.image,
+            attributes=x_t.to(image),
+            image=condition,
+            attributes_timestep=t,
+            image_timestep=zero,
+            attribute_extra=extras.attributes,
+            image_extra=extras.image,
             image_rows=None,
         )
         condition = output.encoded_image  # the same at every step
@@ -90,7 +91,7 @@ def infer_image(
     derived: Bool[Tensor, "b 6"] | None = None,
     step_end: StepEnd | None = None,
 ) -> Float[Tensor, "b 3 H W"]:
-    """Rendering: p(image | attributes), (t_attributes, t_image) = (0, t) in Eq. 3.
+    """Rendering: p(image | attributes), with (t_attributes, t_image) = (0, t~).
 
     Args:
         model: the two streams.
@@ -116,18 +117,18 @@ def infer_image(
     shown = conditioning.by_triplet(given)
     attributes = torch.where(shown, latents, unknown).to(model.dtype)
     extras = extras_by_camera(conditioning, maps["mask"], given, maps, camera, derived).to(attributes)
-    clean = torch.zeros(len(attributes), dtype=torch.long, device=attributes.device)
+    zero = torch.zeros(len(attributes), dtype=torch.long, device=attributes.device)
     condition: Tensor | Encoded = attributes
 
     def predict(x_t: Tensor, t: Tensor) -> Tensor:
         nonlocal condition
         output = model(
-            condition,
-            x_t.to(attributes),
-            clean,
-            t,
-            extras.attributes,
-            extras.image,
+            attributes=condition,
+            image=x_t.to(attributes),
+            attributes_timestep=zero,
+            image_timestep=t,
+            attribute_extra=extras.attributes,
+            image_extra=extras.image,
             image_prior=extras.prior,
             attribute_rows=None,
         )

@@ -5,6 +5,8 @@ Section 3.2 (`conditional`, the default): one stream is always clean, the other 
     (t_attributes, t_image) = (0, t~) when rendering, (t~, 0) when inverse             (Eq. 3)
     t~ = t with probability p_t, T otherwise                                           (Eq. 4)
 
+Notation: `t_tilde` is t~, `last` is T.
+
 Algorithm 1 of the supplement (`algorithm1`): one stream, the same for the whole batch, gets uniform timesteps in
 [0, T]; each entry of the other is 0 or T. Here both streams can be noisy at once, which Section 3.2 rules out.
 
@@ -39,12 +41,11 @@ def conditional_timesteps(batch: int, last: int, p_render: float, p_t: float, ge
         generator: CPU generator.
     """
     rendering = int(batch * p_render + torch.rand((), generator=generator).item())
+    is_render = torch.arange(batch) < rendering
     partial = torch.rand(batch, generator=generator) < p_t
     t = torch.randint(1, last, (batch,), generator=generator)
-    noisy = torch.where(partial, t, last)
-    is_render = torch.arange(batch) < rendering
-    zero = torch.zeros_like(noisy)
-    return Timesteps(attributes=torch.where(is_render, zero, noisy), image=torch.where(is_render, noisy, zero))
+    t_tilde = torch.where(partial, t, last)  # Eq. 4
+    return Timesteps(attributes=torch.where(is_render, 0, t_tilde), image=torch.where(is_render, t_tilde, 0))  # Eq. 3
 
 
 def algorithm1_timesteps(batch: int, last: int, generator: torch.Generator) -> Timesteps:

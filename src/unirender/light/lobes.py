@@ -17,8 +17,9 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from unirender.light.environment import check_map, environment_directions, resample_environment, texel_solid_angles
+from unirender.light.environment import check_map, environment_directions, texel_solid_angles
 from unirender.light.ggx import dot, facing_normal, halton, smith_g1, tangents, unit, visible_normals
+from unirender.light.resampling import resample_environment
 from unirender.light.subpixel import inside
 
 TAIL_SHAPE = (64, 128)  # texels over which the tails of sharp lobes are integrated

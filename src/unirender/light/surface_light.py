@@ -1,8 +1,9 @@
 """The light that a surface receives from an environment, in closed form: d and s without shadows.
 
-    d(n) = 1/pi integral of E(l) max(n . l, 0) dl,    s(n, v) = integral of E(l) f(l, v) max(n . l, 0) dl
+    L(v) = integral of f(l, v) E(l) max(n . l, 0) dl                                   (Eq. 1)
+    d = L of f = 1 / pi,    s = L of f the GGX lobe of a reflector of F = 1
 
-with E the map and f the GGX lobe of a reflector of F = 1: the rendering equation (paper Eq. 1) of two fixed surfaces.
+with E the map: the paper's rendering equation, of two fixed surfaces.
 Both follow from normals, roughness and the map alone (`light.environment` fixes its grid); what the ground truth
 renders has shadows besides. `unirender bench derived-light` measures how near they come.
 

@@ -17,8 +17,8 @@ from unirender.camera import Camera
 from unirender.color import HdrCurve
 from unirender.errors import UnirenderError
 from unirender.models.codec import Codec
-from unirender.models.packing import HDR_CURVES, TRIPLETS, Packing, pack_image, unpack_image
-from unirender.models.priors import PRIORS, Maps, Prior
+from unirender.models.packing import HDR_CURVES, TRIPLETS, Maps, Packing, pack_image, unpack_image
+from unirender.models.priors import PRIORS, Prior
 
 DERIVED_FLAG = 0.5  # between given and not given
 RAY_SCALE = 3.0  # brings the default camera's ray slopes to about [-1, 1]

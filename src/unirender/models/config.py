@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-# Options of earlier versions' networks, each with the value that means what a network is without it.
+# Options of earlier networks, which the shipped ones name, each with the value that means what a network is without.
 GONE = {"light": "latent", "picture_features": "none"}
 ENVIRONMENT_SIZE = (16, 32)  # rows, columns of the light that every model predicts; whole pixels make up a texel
 

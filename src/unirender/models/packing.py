@@ -20,7 +20,8 @@ from torch import Tensor
 
 from unirender.color import HdrCurve
 from unirender.errors import UnirenderError
-from unirender.models.priors import Maps
+
+Maps = dict[str, Tensor]  # by the names of `unirender.intrinsics.MAPS`, in physical units [b c H W]
 
 TRIPLETS = ("material", "albedo", "normal", "specular", "diffuse", "environment")
 HDR_CURVES: dict[str, tuple[float, float]] = {

@@ -18,8 +18,7 @@ from torch import Tensor
 from unirender.camera import Camera
 from unirender.composite import composite, composite_image, environment_brdf_tables, fresnel, lobes, split_sum_image
 from unirender.intrinsics import Intrinsics
-
-Maps = dict[str, Tensor]
+from unirender.models.packing import Maps
 
 SHORT = 0.1  # predicted normals below this length have no direction; keeps the gradient of the rest finite
 

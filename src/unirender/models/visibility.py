@@ -147,10 +147,10 @@ def _window(surface: Bool[np.ndarray, "h w"]) -> tuple[slice, slice]:
 
 
 @functools.cache
-def load_visibility_net(path: Path = WEIGHTS) -> VisibilityNet:
+def load_visibility_net() -> VisibilityNet:
     """The network that ships, on the CPU."""
     net = VisibilityNet().eval().requires_grad_(False)
-    net.load_state_dict({name: value.float() for name, value in load_file(path).items()})
+    net.load_state_dict({name: value.float() for name, value in load_file(WEIGHTS).items()})
     return net
 
 

@@ -17,7 +17,7 @@ from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 from diffusers.pipelines.pipeline_utils import DiffusionPipeline
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 
-from unirender.diffusion.sampling import check_scheduler, check_timesteps, make_sampler
+from unirender.diffusion.samplers import check_scheduler, check_timesteps, make_sampler
 from unirender.errors import UnirenderError
 from unirender.models.codec import make_codec
 from unirender.models.conditioning import Conditioning

@@ -18,7 +18,7 @@ from scipy.ndimage import label
 from unirender.blocks import by_rows, row_blocks
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender.pipelines.masked_maps import divide, unit_normal
 
 SMALL = 2 / 3  # an object whose square has at most this share of the picture's side is cut out

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from unirender.camera import Camera
-from unirender.diffusion.sampling import is_whole
+from unirender.diffusion.steps import is_whole
 from unirender.errors import UnirenderError
 from unirender.light.symmetries import Maps, mirror, permute_channels
 from unirender.models.packing import Packing

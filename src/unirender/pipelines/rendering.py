@@ -12,9 +12,9 @@ from unirender.color import srgb_decode
 from unirender.intrinsics import Intrinsics
 from unirender.models.priors import PRIORS
 from unirender.pipelines.framing import Frame
-from unirender.pipelines.inputs import ready_to_render, to_derive, told_derived
 from unirender.pipelines.masked_maps import divide
 from unirender.pipelines.network import Network, Overflow
+from unirender.pipelines.rendered_maps import ready_to_render, to_derive, told_derived
 from unirender.pipelines.settings import Sampling
 
 

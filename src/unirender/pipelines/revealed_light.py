@@ -22,9 +22,9 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment
 from unirender.light.ggx import facing_normal
 from unirender.light.lobes import LOBE_WIDTH, cosine_matrix, lobe_matrix
+from unirender.light.resampling import resample_environment
 from unirender.pipelines.framing import Frame
 from unirender.vectors import nonzero
 

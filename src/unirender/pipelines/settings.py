@@ -9,7 +9,8 @@ from jaxtyping import Float
 
 from unirender.arguments import check_switches
 from unirender.camera import Camera
-from unirender.diffusion.sampling import NUM_SAMPLES, Generators, StepEnd, is_whole, steps_of
+from unirender.diffusion.sampling import Generators, StepEnd
+from unirender.diffusion.steps import NUM_SAMPLES, is_whole, steps_of
 from unirender.errors import UnirenderError
 from unirender.pipelines.looks import check_looks
 

@@ -34,18 +34,9 @@ from unirender.pipelines.decomposing import View, decompose_views
 from unirender.pipelines.dual_stream_pipeline import DualStreamPipeline
 from unirender.pipelines.editing import anchor, check_exposure, specular_for_roughness, too_coarse, under_light
 from unirender.pipelines.framing import thumbnail
-from unirender.pipelines.inputs import (
-    as_environment,
-    as_list,
-    as_material,
-    as_picture,
-    check_decomposition,
-    check_rendered,
-    ready_to_render,
-    report_facing_away,
-    told_derived,
-)
+from unirender.pipelines.inputs import as_environment, as_list, as_material, as_picture, check_decomposition
 from unirender.pipelines.network import Overflow
+from unirender.pipelines.rendered_maps import check_rendered, ready_to_render, report_facing_away, told_derived
 from unirender.pipelines.rendering import enter, render_any_size
 from unirender.pipelines.results import Decomposition, EditResult
 from unirender.pipelines.settings import (

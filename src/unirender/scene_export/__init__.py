@@ -18,7 +18,7 @@ Axes: those of the camera, moved to the middle of the object: +x right, +y up, +
 on +z at `Camera.distance()`, where a unit sphere fills 0.9 of the frame's height, and the card is the plane z = 0. The
 middle of the light's map is +z. Light is in display units: a render at exposure 1 shows through sRGB what the picture
 showed. Mitsuba draws directions by the texels times sin(theta) and would miss light of the first or the last row that
-has little beside it: such a light is written with a row between each two (`unirender.light.environment.drawable`).
+has little beside it: such a light is written with a row between each two (`unirender.light.for_mitsuba.drawable`).
 
 What a card cannot show: it has one depth, so that nothing casts a shadow and the maps hold from the camera's place
 only; and normals that face away from the viewer are bent until they do not (a renderer would show them black or
@@ -34,8 +34,9 @@ from types import MappingProxyType
 from typing import Any
 
 from unirender.arguments import check_switches
-from unirender.files import new_folder, write_meta
+from unirender.files import write_meta
 from unirender.intrinsics import Intrinsics
+from unirender.new_folders import new_folder
 from unirender.scene_export.card import Card
 from unirender.scene_export.gltf import write_gltf
 from unirender.scene_export.mitsuba_scene import write_mitsuba
@@ -63,7 +64,7 @@ def write_scene(folder: Path, intrinsics: Intrinsics, meta: Mapping[str, Any] = 
     """Writes the scene into an existing (temporary) folder.
 
     Args:
-        folder: where; see `unirender.files.new_folder`.
+        folder: where; see `unirender.new_folders.new_folder`.
         intrinsics: as in `export_scene`.
         meta: facts on where the maps come from, for `meta.json`.
 

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.exr import image_channels, write_environment, write_exr
-from unirender.light.environment import area_pixels, drawable, pfm_bytes
+from unirender.light.for_mitsuba import drawable, pfm_bytes
+from unirender.light.resampling import area_pixels
 from unirender.scene_export.card import Card
 from unirender.visualization import write_png
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from unirender.errors import UnirenderError
 
 HALF_MADE = ".*.????????"  # folders of `cached_folder`
-HALF_WRITTEN = re.compile(r"\.(.+)\.[0-9a-f]{12}")  # folders of `files.new_folder`
+HALF_WRITTEN = re.compile(r"\.(.+)\.[0-9a-f]{12}")  # folders of `new_folders.new_folder`
 FORGOTTEN_S = 24 * 3600.0  # seconds after which nobody is still writing to one: it takes minutes
 
 
@@ -60,7 +60,7 @@ def cached_folder(folder: Path) -> Iterator[Path]:
 
 
 def forget_half_made(parent: Path, names: Collection[str]) -> None:
-    """Deletes the temporary folders of `files.new_folder(parent / name)` that a killed process left, after a day.
+    """Deletes the temporary folders of `new_folders.new_folder(parent / name)` that a killed process left, after a day.
 
     Nothing in a folder that may be written to but not listed, as one is that others hand in to.
     """

@@ -33,7 +33,7 @@ def replace_file(path: Path, content: str | bytes) -> Path:
     if place.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     place.parent.mkdir(parents=True, exist_ok=True)
-    with _renamed(place, aside(place, "partial"), "xb") as file:
+    with _renamed(place, aside(place), "xb") as file:
         file.write(data)
     return path
 
@@ -43,13 +43,13 @@ def is_special(path: Path) -> bool:
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
-def aside(path: Path, ending: str) -> Path:
+def aside(path: Path) -> Path:
     """A hidden name beside a file or folder, which nobody else uses: for what is renamed to `path` when it is complete.
 
     Made by `open` or `mkdir` it has the rights that the user's umask leaves, and a folder's group where that is passed
     on; what `tempfile` makes is its owner's alone.
     """
-    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.{ending}")
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
 
 
 def whole_file(path: Path) -> contextlib.AbstractContextManager[BinaryIO]:

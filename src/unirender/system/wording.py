@@ -22,6 +22,12 @@ def one_of(word: str, known: Iterable[str]) -> str:
     return f"expected one of {', '.join(names)}{meant(near(word, names))}"
 
 
+def instead(word: str, known: Iterable[str]) -> str:
+    """What ends a sentence on a word that is none of many known names: those that may be meant, else all of them."""
+    names = list(known)
+    return meant(near(word, names)) or f"; expected one of {', '.join(names)}"
+
+
 def counted(count: int, noun: str) -> str:
     """So many of something: `1 shard`, `1,200 shards`."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"

@@ -210,7 +210,7 @@ def calls(model: torch.nn.Module, action: Any) -> list[tuple[int, range, range]]
     found = []
 
     def watch(_: Any, given: tuple[Any, ...], named: dict[str, Any]) -> None:
-        count = len(given[0])
+        count = len(given[0] if given else named["attributes"])
         wanted = (named.get(name, slice(None)) for name in ("attribute_rows", "image_rows"))
         found.append((count, *(range(0) if rows is None else range(*rows.indices(count)) for rows in wanted)))
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from unirender.command_line.options import MOST_STEPS
+from unirender.diffusion.steps import MOST_STEPS
 from unirender.errors import UsageError
 from unirender_evaluation.studies.optimiser.commands import BenchIngredients, BenchRace
 from unirender_evaluation.studies.sampling.command import BenchSampling

@@ -15,7 +15,9 @@ from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, image_channels, read_exr, write_exr
-from unirender.light.environment import area_pixels, environment_directions, middle_rows, sample_environment
+from unirender.light.environment import environment_directions, sample_environment
+from unirender.light.for_mitsuba import middle_rows
+from unirender.light.resampling import area_pixels
 from unirender_reference.backend import mitsuba
 from unirender_reference.lights import load_light
 from unirender_reference.meshes import load_mesh, load_mesh_placed

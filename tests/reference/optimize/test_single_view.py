@@ -12,7 +12,7 @@ from unirender.camera import Camera
 from unirender.color import image_srgb, srgb_decode, unpremultiply
 from unirender.errors import UnirenderError, UsageError
 from unirender.intrinsics import MAPS, Intrinsics
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender.system import machine
 from unirender_reference.optimize.single.config import (
     COLD,

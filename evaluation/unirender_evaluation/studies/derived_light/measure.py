@@ -25,8 +25,8 @@ from unirender.camera import Camera
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment
 from unirender.light.ggx import facing_normal
+from unirender.light.resampling import resample_environment
 from unirender.light.surface_light import diffuse_light, lobe_light, specular_light
 from unirender_evaluation.metrics import metric_key, psnr
 from unirender_evaluation.records import Record

@@ -28,7 +28,8 @@ from scipy.stats import t as student_t
 from unirender.color import image_srgb
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment, texel_solid_angles
+from unirender.light.environment import texel_solid_angles
+from unirender.light.resampling import resample_environment
 from unirender_evaluation.metrics import LOG_EPSILON
 
 MAPS = ("albedo", "normal", "roughness", "metallic", "specular", "diffuse", "environment")

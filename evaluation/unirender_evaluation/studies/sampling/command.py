@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Literal
 
 from unirender.command_line.option_checks import at_least
-from unirender.command_line.options import MOST_STEPS, Device
+from unirender.command_line.options import Device
+from unirender.diffusion.steps import MOST_STEPS
 from unirender.errors import UsageError
 
 

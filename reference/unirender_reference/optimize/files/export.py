@@ -13,7 +13,8 @@ import numpy as np
 
 from unirender.camera import Camera
 from unirender.exr import image_channels, write_environment, write_exr
-from unirender.light.environment import area_pixels, drawable, pfm_bytes
+from unirender.light.for_mitsuba import drawable, pfm_bytes
+from unirender.light.resampling import area_pixels
 from unirender_reference.optimize.files.glb import glb_bytes, png_bytes, texture_pixels
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.shapes import MeshObject, Sphere

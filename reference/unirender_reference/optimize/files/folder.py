@@ -21,7 +21,7 @@ from unirender.camera import Camera
 from unirender.color import unpremultiply
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, header_camera, image_channels, read_exr, write_exr
-from unirender.files import new_folder
+from unirender.new_folders import new_folder
 from unirender.picture_files.display_files import is_turned
 from unirender.pictures import check_finite, check_mask, negative_share, read_mask, read_picture
 from unirender.visualization import write_png

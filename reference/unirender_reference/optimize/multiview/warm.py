@@ -15,7 +15,8 @@ from scipy import ndimage
 
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment, rotate_environment
+from unirender.light.environment import rotate_environment
+from unirender.light.resampling import resample_environment
 from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.shape.uv import charted
 from unirender_reference.optimize.solution import Solution

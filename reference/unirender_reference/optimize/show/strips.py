@@ -10,7 +10,8 @@ from PIL import Image
 
 from unirender.camera import Camera
 from unirender.color import image_srgb, luminance, srgb_decode
-from unirender.light.environment import mean_radiance, resample_environment
+from unirender.light.environment import mean_radiance
+from unirender.light.resampling import resample_environment
 from unirender_reference.lights import bundled_light
 from unirender_reference.multiview import pose_towards
 from unirender_reference.optimize.solution import Solution

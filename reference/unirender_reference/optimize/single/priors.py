@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import sparse
 
-from unirender.light.environment import hat_weights
+from unirender.light.resampling import hat_weights
 from unirender_reference.optimize.numerics.differences import difference_matrix
 from unirender_reference.optimize.single.config import Priors
 from unirender_reference.optimize.transport.light_grid import LightGrid

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.color import unpremultiply
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender_reference.optimize.single.config import Trust
 from unirender_reference.optimize.single.fit import DARKEST, Fit, Unknowns
 from unirender_reference.optimize.single.inflate import nearest

@@ -16,7 +16,7 @@ from unirender.camera import Camera
 from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.light.environment import resample_environment
+from unirender.light.resampling import resample_environment
 from unirender_reference.optimize.exposure import exposed, exposure_of
 from unirender_reference.optimize.shape.placement import check_in_picture
 from unirender_reference.optimize.single.config import COLD, SingleConfig

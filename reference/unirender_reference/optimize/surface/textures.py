@@ -9,7 +9,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg
 from jaxtyping import Float
 
-from unirender.light.environment import hat_weights
+from unirender.light.resampling import hat_weights
 from unirender_reference.optimize.numerics.differences import difference_matrix, side_by_side
 from unirender_reference.optimize.numerics.robust import HUBER
 from unirender_reference.optimize.surface.points import SurfacePoints

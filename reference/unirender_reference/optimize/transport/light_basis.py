@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from unirender.light.environment import hat_weights
+from unirender.light.resampling import hat_weights
 from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.transport.light_grid import LightGrid
 

@@ -97,7 +97,7 @@ def average(checkpoints: Sequence[Path], shares: Sequence[float], out: Path, sto
     import diffusers
     import torch
 
-    from unirender.files import new_folder
+    from unirender.new_folders import new_folder
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
     from unirender.shipped import checkpoint_folder
     from unirender.system.writing import writing

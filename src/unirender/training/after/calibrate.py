@@ -74,8 +74,8 @@ def calibrate(options: Calibrate) -> "dict[str, Line]":
     """
     import diffusers
 
-    from unirender.files import new_folder
     from unirender.models.precision import resolve_device
+    from unirender.new_folders import new_folder
     from unirender.pipelines.calibration import NAMES
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
     from unirender.shipped import checkpoint_folder

@@ -2,7 +2,7 @@
 
 Turning a map and resampling it are linear, so both are one sparse matrix per (source size, target size, turns). A
 target texel is the integral of the turned bilinear radiance against the texel's own bilinear weight, divided by the
-integral of that weight, as in `light.environment.resample_environment`: the energy of a sun smaller than a texel is
+integral of that weight, as in `light.resampling.resample_environment`: the energy of a sun smaller than a texel is
 kept, where sampling the turned map at texel directions would lose or double it.
 
 A map that has that size already would be blurred by such an integral, of its own tent and of the target's.
@@ -20,7 +20,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
-from unirender.light.environment import resample_environment, texel_solid_angles
+from unirender.light.environment import texel_solid_angles
+from unirender.light.resampling import resample_environment
 
 QUADRATURE_TEXELS = 4  # integration points per texel along each axis, on the grid of the source
 QUADRATURE_ROWS = 512  # no more than that, unless the source itself has more

@@ -9,7 +9,6 @@ time, or one pair of any other group.
 import functools
 import hashlib
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +52,6 @@ class GroupDataset:
         self,
         folder: str | Path,
         shards: tuple[str, ...] | None = None,
-        progress: Callable[[int, int], None] | None = None,
         derived: bool = False,
     ) -> None:
         """Opens a folder; shards not used before are decoded once.
@@ -62,7 +60,6 @@ class GroupDataset:
             folder: as written by `unirender dataset`, with or without a recipe; it may still be growing.
             shards: names of the shards to use; None: all that are complete. A resumed training passes `shard_names` of
                 the interrupted one, so that a folder that grew in between gives the same stream.
-            progress: called with (shards opened, shards in all); then with those whose light is derived, if any is.
             derived: whether samples may have s and d derived from their light besides; takes one or two seconds
                 for each group that was not derived before (`unirender.training.data.derived`).
         """
@@ -79,11 +76,7 @@ class GroupDataset:
                 )
             available = {path: sha256 for path, sha256 in available.items() if names[path] in shards}
         self._paths = tuple(available)
-        self.shards: list[Shard] = []
-        for path, sha256 in available.items():
-            self.shards.append(open_packed(path, sha256, names[path]))
-            if progress is not None:
-                progress(len(self.shards), len(available))
+        self.shards: list[Shard] = [open_packed(path, sha256, names[path]) for path, sha256 in available.items()]
         self._derived: list[DerivedLight] | None = None
         sizes = {shard.shared.shape[-2:]: shard.name for shard in self.shards}
         if len(sizes) != 1:
@@ -101,19 +94,15 @@ class GroupDataset:
             self._items += [(i, None)] if i in self._basis else [(i, pair) for pair in group.pairs]
         self.fingerprint = hashlib.sha256(" ".join(shard.sha256 for shard in self.shards).encode()).hexdigest()
         if derived:  # the last, as it may take long: a folder that is refused is refused before
-            self.derive(progress)
+            self.derive()
 
     def __repr__(self) -> str:
         height, width = self.resolution
         return f"GroupDataset({self.folder}, {len(self.keys)} groups of {height} x {width} px)"
 
-    def derive(self, progress: Callable[[int, int], None] | None = None) -> None:
-        """Opens s and d as derived from their light, and derives first what was not derived before.
-
-        Args:
-            progress: called with (shards derived, shards to derive).
-        """
-        self._derived = open_derived(list(zip(self._paths, self.shards, strict=True)), progress)
+    def derive(self) -> None:
+        """Opens s and d as derived from their light, and derives first what was not derived before."""
+        self._derived = open_derived(list(zip(self._paths, self.shards, strict=True)))
 
     def _check_keys(self) -> None:
         """Looks for groups that are there twice; meshes of one name in two parts are two objects.

@@ -57,14 +57,11 @@ class DerivedLight:
         return pixels[self.rows[np.asarray(rows)]]
 
 
-def open_derived(
-    shards: Sequence[tuple[Path, Shard]], progress: Callable[[int, int], None] | None = None
-) -> list[DerivedLight]:
+def open_derived(shards: Sequence[tuple[Path, Shard]]) -> list[DerivedLight]:
     """Opens the derived light of shards, a `DerivedLight` each; what has not been derived yet is, on all cores.
 
     Args:
         shards: with the tars that they were packed from.
-        progress: called with (shards derived, shards to derive).
 
     Raises:
         UnirenderError: the cache cannot be written, or a tar is not what was packed.
@@ -75,9 +72,7 @@ def open_derived(
         logger.warning("deriving the light of %d groups of %d shards once, 1 or 2 seconds each", groups, len(missing))
         workers = min(len(missing), os.cpu_count() or 1)
         with WorkerPool(workers, one_thread) as pool:
-            for done, _ in enumerate(pool.map(_derive, *zip(*missing, strict=True)), start=1):
-                if progress is not None:
-                    progress(done, len(missing))
+            list(pool.map(_derive, *zip(*missing, strict=True)))
     return [_open(_folder(shard)) for _, shard in shards]
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import torch
 
 from unirender.errors import UnirenderError
-from unirender.models.config import GONE as GONE_FROM_NETWORKS
 from unirender.system.whole_files import whole_file
 from unirender.system.writing import writing
 from unirender.training.config import TrainConfig
@@ -19,14 +18,6 @@ from unirender.training.loop.card import OF_A_RUN
 STATE_FILE = "state.pt"
 PICTURES = "pictures"
 LENGTH = {"steps", "minutes"}  # a resumed run may be given another; minutes: in the account beside a pipeline only
-# Entries of earlier versions that are gone, each with the value that means what a run is without it.
-GONE = {f"model.{name}": value for name, value in GONE_FROM_NETWORKS.items()} | {
-    "loss.answers": 0.0,
-    "loss.cycle_steps": 1,
-    "loss.snr_bound": 5.0,
-    "loss.timestep_weight": "none",
-    "trains": "all",
-}
 
 
 def save_state(folder: Path, state: dict[str, Any]) -> Path:
@@ -104,7 +95,6 @@ def differences(stored: dict[str, Any], config: TrainConfig) -> list[str]:
     The length of a run is no difference.
     """
     theirs, own = (dict(_leaves(tree)) for tree in (with_defaults(stored), plain(config)))
-    theirs = {name: value for name, value in theirs.items() if name not in GONE or value != GONE[name]}
     names = sorted((theirs.keys() | own.keys()) - LENGTH)
     return [f"{n} {theirs.get(n)!r} instead of {own.get(n)!r}" for n in names if theirs.get(n) != own.get(n)]
 

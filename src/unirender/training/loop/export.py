@@ -76,26 +76,21 @@ def save_weights(pipeline: UniRenderPipeline, folder: Path) -> None:
         weights.chmod(rights)
 
 
-def export_pipeline(
-    trainer: "Trainer",
-    folder: Path,
-    dtype: torch.dtype = torch.float16,
-    beside: Mapping[str, str] = MappingProxyType({}),
-) -> Path:
+def export_pipeline(trainer: "Trainer", folder: Path, beside: Mapping[str, str] = MappingProxyType({})) -> Path:
     """Writes the averaged weights as a pipeline with what is known of the run beside it.
 
     That is `training.json`, with the same of the runs that it continues, and a model card, `README.md`.
 
-    Other files, by name, stand in `beside`. The folder is moved into place when it is complete. Weights are stored as
-    `dtype`; `UniRenderPipeline.from_pretrained` loads them as float32 unless told otherwise.
+    Other files, by name, stand in `beside`. The folder is moved into place when it is complete. Weights are stored in
+    float16; `UniRenderPipeline.from_pretrained` loads them as float32 unless told otherwise.
 
     Raises:
         UnirenderError: it cannot be written; what was there stays.
     """
     partial = partial_folder(folder)
     shutil.rmtree(partial, ignore_errors=True)
-    pipeline = averaged_pipeline(trainer, dtype, torch.device("cpu"))
-    facts = training_facts(trainer) | {"stored_as": str(dtype).removeprefix("torch.")}
+    pipeline = averaged_pipeline(trainer, torch.float16, torch.device("cpu"))
+    facts = training_facts(trainer) | {"stored_as": "float16"}
     chosen = json.loads(beside[SCORES_FILE]) if SCORES_FILE in beside else None
     if chosen is not None:  # the log may have other scores of this step, on other scenes
         facts["scores"] = {name: score["value"] for name, score in chosen["scores"].items()}

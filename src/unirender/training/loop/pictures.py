@@ -10,8 +10,7 @@ from torch import Tensor
 
 from unirender.color import image_srgb
 from unirender.diffusion.inference import infer_attributes, infer_image
-from unirender.models.packing import TRIPLETS
-from unirender.models.priors import Maps
+from unirender.models.packing import TRIPLETS, Maps
 from unirender.system.whole_files import whole_file
 from unirender.system.writing import writing
 from unirender.training.losses.loss_function import LossFunction

@@ -23,7 +23,7 @@ from torch import nn
 from unirender.diffusion.schedule import make_scheduler
 from unirender.errors import UnirenderError
 from unirender.models.build import build_model
-from unirender.models.priors import Maps
+from unirender.models.packing import Maps
 from unirender.system.ends import Ended
 from unirender.training.config import OptimizerConfig, RunConfig, TrainConfig
 from unirender.training.config_check import check_config

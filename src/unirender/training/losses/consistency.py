@@ -1,8 +1,13 @@
-"""The losses that compare what the predicted attributes look like with the true image, on inverse rows.
+"""The losses that compare what the predicted attributes C look like with the true image, on inverse rows.
 
-`cycle` (paper Eq. 5, "cycle-consistent constraint"): the network renders them again, from pure noise in one step.
-`composite` (ours): their closed-form image; no network takes part, so nothing can learn to accept wrong maps, but
-shadowed highlights and interreflection are then explained by the maps.
+    cycle       |i_0 - i_0'(C, i_T, 0, T)|^2                                           (Eq. 5)
+    composite   |srgb(I) - srgb(I'(C))|^2
+
+`cycle` (the paper's "cycle-consistent constraint"): the network renders them again, i_0', from pure noise i_T in one
+step. `composite` (ours): I' is their closed-form image; no network takes part, so nothing can learn to accept wrong
+maps, but shadowed highlights and interreflection are then explained by the maps.
+
+Notation: i_0 latents of the true image I; T the last timestep.
 """
 
 from dataclasses import dataclass
@@ -43,7 +48,7 @@ class Consistency:
     def cycle(
         self,
         predicted: Float[Tensor, "b nc h w"],
-        clean_i: Float[Tensor, "b c h w"],
+        i_0: Float[Tensor, "b c h w"],
         mask: Float[Tensor, "b 1 H W"],
         generator: torch.Generator,
     ) -> Float[Tensor, ""]:
@@ -53,15 +58,15 @@ class Consistency:
         them, but not the weights of the rendering pass.
 
         Args:
-            predicted: of the training step.
-            clean_i: latents of the true image.
+            predicted: C, of the training step.
+            i_0: latents of the true image.
             mask: coverage.
             generator: CPU generator of the noise.
         """
         if self.config.cycle_into_renderer:
-            return self._rendered(predicted, clean_i, mask, generator)
+            return self._rendered(predicted, i_0, mask, generator)
         leaf = predicted.detach().requires_grad_()
-        error = self._rendered(leaf, clean_i, mask, generator)
+        error = self._rendered(leaf, i_0, mask, generator)
         (gradient,) = gradients(error, [leaf], self.scale)
         assert gradient is not None, "what is rendered comes of it"
         return _with_gradient(error.detach(), predicted, gradient)
@@ -90,16 +95,17 @@ class Consistency:
         return weighted_mean(error, self.errors.pixel_weights(mask).expand_as(error))
 
     def _rendered(
-        self, attributes: Float[Tensor, "b nc h w"], clean_i: Tensor, mask: Tensor, generator: torch.Generator
+        self, attributes: Float[Tensor, "b nc h w"], i_0: Tensor, mask: Tensor, generator: torch.Generator
     ) -> Float[Tensor, ""]:
-        """The error of the picture that the attributes render to, from pure noise in one step."""
+        """|i_0 - i_0'(C, i_T, 0, T)|^2."""
         given = torch.ones(len(attributes), len(TRIPLETS), dtype=torch.bool, device=attributes.device)
         extras = self.conditioning.extras(mask, given, self.conditioning.decode_given(attributes))
-        t = torch.full((len(attributes),), last_timestep(self.scheduler), device=attributes.device)
-        timesteps = Timesteps(torch.zeros_like(t), t)
-        output = predict(self.model, attributes, noise_like(clean_i, generator), timesteps, extras, None, ALL)
+        i_T = noise_like(i_0, generator)
+        T = torch.full((len(attributes),), last_timestep(self.scheduler), device=attributes.device)
+        rendering = Timesteps(attributes=torch.zeros_like(T), image=T)
+        output = predict(self.model, attributes, i_T, rendering, extras, None, ALL)
         assert output.image is not None
-        return self.errors.image(output.image, clean_i, mask)
+        return self.errors.image(output.image, i_0, mask)
 
 
 def _with_gradient(value: Tensor, x: Tensor, gradient: Tensor) -> Float[Tensor, ""]:

@@ -1,12 +1,17 @@
-"""The loss of one batch: x0 regression in both directions, and consistency with the image (paper Sec. 3.2, Eq. 5).
+"""The loss of one batch: x0 regression in both directions, and consistency with the image (paper Sec. 3.2).
 
-The regression is UniDiffuser's (paper Eq. 2), of x0 in place of the noise. Each stream is compared where it is noisy:
-the image stream's x0 with the true image, the attribute stream's with each of the six attribute pictures. Every picture
-has a weight of its own. Pixels are weighted by coverage (those of the light: all alike). In an *inverse* row the image
-is clean and the attributes are not. There the predicted attributes are rendered, too, and compared with the image: see
+    a_0', i_0' = f(a_t, i_t, t_a, t_i)
+    L = sum over k of  w_k |a_0 - a_0'|_k^2  +  w_image |i_0 - i_0'|^2                 (Eq. 2)
+      + w_cycle |i_0 - i_0'(a_0', i_T, 0, T)|^2                                        (Eq. 5)
+
+The regression is UniDiffuser's, of x0 in place of the noise. Each stream is compared where it is noisy: the image
+stream's x0 with the true image, the attribute stream's with each of the six attribute pictures k. Every picture has a
+weight of its own. Pixels are weighted by coverage (those of the light: all alike). In an *inverse* row the image is
+clean and the attributes are not. There the predicted attributes are rendered, too, and compared with the image: see
 `unirender.training.losses.consistency`.
 
-Notation: a attributes, i image, t timestep, n = 6 pictures of c latent channels each.
+Notation: a attributes, i image, a_0 clean latents, a_t noised ones, a_0' predicted ones; t timestep; f the network
+(`unirender.models.dual_stream`); n = 6 pictures of c latent channels each.
 """
 
 from dataclasses import dataclass
@@ -20,9 +25,8 @@ from unirender.diffusion.schedule import add_noise
 from unirender.diffusion.timesteps import Timesteps
 from unirender.models.conditioning import Conditioning, Extras
 from unirender.models.dual_stream import DualStreamModel, DualStreamOutput
-from unirender.models.packing import TRIPLETS
-from unirender.models.priors import Maps
-from unirender.pipelines.inputs import told_derived
+from unirender.models.packing import TRIPLETS, Maps
+from unirender.pipelines.rendered_maps import told_derived
 from unirender.training.config import LossConfig
 from unirender.training.losses.consistency import Consistency
 from unirender.training.losses.terms import Errors, LossTerms, noise_like, predict
@@ -59,27 +63,27 @@ class LossFunction:
                 do not stand together; under Section 3.2's rule they do.
             generator: CPU generator of noise and dropped maps.
         """
-        clean_a, clean_i = self._encode(batch)
+        a_0, i_0 = self._encode(batch)
         noisy_a, noisy_i = (t.cpu() > 0 for t in (timesteps.attributes, timesteps.image))  # a GPU is waited for once
-        attributes, image, extras = self._noised(batch, clean_a, clean_i, timesteps, noisy_a, generator)
+        a_t, i_t, extras = self._noised(batch, a_0, i_0, timesteps, noisy_a, generator)
         span_a, span_i = _span(noisy_a), _span(noisy_i)
-        output = predict(self.model, attributes, image, timesteps, extras, span_a, span_i)
+        output = predict(self.model, a_t, i_t, timesteps, extras, span_a, span_i)
         errors = Errors(self.conditioning, self.config.background)
         terms: LossTerms = {}
         if span_i is not None:
             assert output.image is not None
             rows = _Rows(span_i, noisy_i)
-            truth, mask = (rows.of(x) for x in (clean_i, batch["mask"]))
+            truth, mask = (rows.of(x) for x in (i_0, batch["mask"]))
             predicted = rows.of_decoded(output.image)
             terms["image"] = errors.image(predicted, truth, mask, self.config.image_floor)
         if span_a is not None:
             assert output.attributes is not None
             rows = _Rows(span_a, noisy_a)
-            truth, mask = (rows.of(x) for x in (clean_a, batch["mask"]))
+            truth, mask = (rows.of(x) for x in (a_0, batch["mask"]))
             predicted = rows.of_decoded(output.attributes)
             terms |= errors.attributes(predicted, truth, mask, self.config.colour_floor)
             inverse = _Rows(span_a, noisy_a & ~noisy_i)
-            terms |= self._inverse_terms(output, clean_i, batch, inverse, errors, generator)
+            terms |= self._inverse_terms(output, i_0, batch, inverse, errors, generator)
         return terms
 
     def total(self, terms: LossTerms) -> Float[Tensor, ""]:
@@ -91,22 +95,22 @@ class LossFunction:
     def _noised(
         self,
         batch: Maps,
-        clean_a: Float[Tensor, "b nc h w"],
-        clean_i: Float[Tensor, "b c h w"],
+        a_0: Float[Tensor, "b nc h w"],
+        i_0: Float[Tensor, "b c h w"],
         timesteps: Timesteps,
         noisy_a: Bool[Tensor, " b"],
         generator: torch.Generator,
     ) -> tuple[Float[Tensor, "b nc h w"], Float[Tensor, "b c h w"], Extras]:
         """Both streams' latents at their timesteps, and what enters beside them; dropped maps are noise throughout."""
         seen, derived = self._seen(batch, timesteps.attributes == 0)
-        shown_a = clean_a if seen is batch else self._encode_attributes(seen)
-        given = self._draw_given(len(clean_a), generator) & ~noisy_a[:, None]
-        known = self.conditioning.by_triplet(given | noisy_a[:, None]).to(clean_a.device)
-        given = given.to(clean_a.device)
-        noise_a = noise_like(clean_a, generator)
-        attributes = torch.where(known, add_noise(self.scheduler, shown_a, noise_a, timesteps.attributes), noise_a)
-        image = add_noise(self.scheduler, clean_i, noise_like(clean_i, generator), timesteps.image)
-        return attributes, image, self.conditioning.extras(batch["mask"], given, seen, derived=derived)
+        shown_a = a_0 if seen is batch else self._encode_attributes(seen)
+        given = self._draw_given(len(a_0), generator) & ~noisy_a[:, None]
+        known = self.conditioning.by_triplet(given | noisy_a[:, None]).to(a_0.device)
+        given = given.to(a_0.device)
+        noise_a = noise_like(a_0, generator)
+        a_t = torch.where(known, add_noise(self.scheduler, shown_a, noise_a, timesteps.attributes), noise_a)
+        i_t = add_noise(self.scheduler, i_0, noise_like(i_0, generator), timesteps.image)
+        return a_t, i_t, self.conditioning.extras(batch["mask"], given, seen, derived=derived)
 
     @torch.no_grad()  # an autoencoder is not trained here, and its activations would be kept
     def _encode(self, batch: Maps) -> tuple[Tensor, Tensor]:
@@ -120,7 +124,7 @@ class LossFunction:
         """The maps that a renderer sees, in which s and d may have been derived from the light; and which lack shadows.
 
         Of those that have the shadows that are seen, d alone is said to lack others, as
-        `unirender.pipelines.inputs.told_derived` says it of a light that is given.
+        `unirender.pipelines.rendered_maps.told_derived` says it of a light that is given.
         """
         rows = clean & (batch["derived"].flatten() > 0) if "derived" in batch else None
         if rows is None or not rows.any():
@@ -137,7 +141,7 @@ class LossFunction:
     def _inverse_terms(
         self,
         output: DualStreamOutput,
-        clean_i: Float[Tensor, "b c h w"],
+        i_0: Float[Tensor, "b c h w"],
         batch: Maps,
         inverse: "_Rows",
         errors: Errors,
@@ -146,7 +150,7 @@ class LossFunction:
         """What the attributes predicted of clean images render to; the cycle: of a share of the rows."""
         assert output.attributes is not None
         predicted = inverse.of_decoded(output.attributes).float()
-        truth, image, mask = (inverse.of(x) for x in (clean_i, batch["image"], batch["mask"]))
+        truth, image, mask = (inverse.of(x) for x in (i_0, batch["image"], batch["mask"]))
         consistency = Consistency(self.model, self.conditioning, self.scheduler, self.config, errors, self.scale)
         terms: LossTerms = {}
         if self.config.composite and len(predicted):

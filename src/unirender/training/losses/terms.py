@@ -1,6 +1,11 @@
 """What the losses are made of: one pass through both streams, and squared errors weighted by pixel.
 
-Notation: b batch, H W image size, h w latent size, c latent channels of one picture, n = 6 pictures.
+    x_0' = f(x_t, ...),    |x_0 - x_0'|^2 = sum of m (x_0 - x_0')^2 / sum of m         (Eq. 2)
+
+of one stream, of x0 in place of the noise.
+
+Notation: x_0 `clean` latents, x_0' `predicted` ones, m `weights`; b batch, H W image size, h w latent size, c latent
+channels of one picture, n = 6 pictures.
 """
 
 from collections.abc import Sequence
@@ -30,12 +35,12 @@ def predict(
 ) -> DualStreamOutput:
     """Clean latents of the rows that are asked for in each stream; None: of none."""
     return model(
-        attributes,
-        image,
-        t.attributes,
-        t.image,
-        extras.attributes,
-        extras.image,
+        attributes=attributes,
+        image=image,
+        attributes_timestep=t.attributes,
+        image_timestep=t.image,
+        attribute_extra=extras.attributes,
+        image_extra=extras.image,
         image_prior=extras.prior,
         attribute_rows=rows_a,
         image_rows=rows_i,
@@ -44,7 +49,7 @@ def predict(
 
 @dataclass(frozen=True)
 class Errors:
-    """Mean squared errors of latents: Eq. 2 of the paper for one stream, of x0 in place of the noise.
+    """Mean squared errors of latents, |x_0 - x_0'|^2 of Eq. 2.
 
     Attributes:
         conditioning: whose codec spreads the weights of pixels over latents.

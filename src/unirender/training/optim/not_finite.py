@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from unirender.models.priors import Maps
+from unirender.models.packing import Maps
 from unirender.training.optim.processes import Processes
 
 MOST_NAMED = 5  # maps and groups of a batch in a message

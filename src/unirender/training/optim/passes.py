@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from unirender.diffusion.schedule import last_timestep
 from unirender.diffusion.timesteps import Timesteps, draw_timesteps
 from unirender.errors import UnirenderError
-from unirender.models.priors import Maps
+from unirender.models.packing import Maps
 from unirender.training.config import TrainConfig
 from unirender.training.losses.loss_function import LossFunction
 from unirender.training.losses.terms import COLOURS, Errors, LossTerms, gradients

@@ -3,8 +3,7 @@
 Both streams get the whole U-Net. The attribute stream sees six pictures of c = 4 latent channels where the original
 saw one: its first convolution is the original's, repeated over the six and divided by six, its last one is repeated.
 Fed six identical latents, each stream's first forward pass is then the original's, since the cross connections and the
-extra inputs start at zero. Not so where the light has an encoder of its own (no preset of this shape has one): its
-tokens, zeros at first, take their share of every attention to the prompt.
+extra inputs start at zero.
 
 Stable Diffusion predicts noise (or v) and this project predicts x0: the weights are a beginning for the *features*.
 What the last convolution makes of them is learned anew; the first pass is no useful prediction.
