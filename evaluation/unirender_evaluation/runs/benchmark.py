@@ -57,7 +57,7 @@ from unirender_evaluation.store import KEPT, Job, Store
 from unirender_evaluation.suites.suite import load_suite
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables.build import Table, build_tables
-from unirender_evaluation.tables.protocol import doubts, mask_source
+from unirender_evaluation.tables.protocol import mask_source, with_doubts
 from unirender_evaluation.tasks import scene_ids
 from unirender_evaluation.truth.make import quality_summary
 from unirender_evaluation.verdict import verdict_text
@@ -253,8 +253,7 @@ def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: li
 
 def _described(info: MethodInfo, records: list[Record]) -> MethodInfo:
     """A row with what its records say of it."""
-    note = "; ".join([*filter(None, [info.note]), *doubts(info.key, records)])
-    return replace(info, mask=mask_source(info.key, records), note=note)
+    return replace(with_doubts(info, records), mask=mask_source(info.key, records))
 
 
 def write_outputs(out: Path, result: BenchResult) -> None:
