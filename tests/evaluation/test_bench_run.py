@@ -214,6 +214,7 @@ def test_run_end_to_end_and_again(
         jobs=0,
     )
     missing = sum(row.missing for row in planned(config).rows)
+    monkeypatch.chdir(tmp_path)
     first = run(config, Console(quiet=True))
     assert first.truth_check["passed"], first.truth_check
     assert first.computed == first.asked == missing > 0, "as the dry run said, with the records of no value"

@@ -10,6 +10,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.light.environment import environment_directions
 from unirender_evaluation.light_metrics import scaled_log_rmse
 from unirender_evaluation.methods.mistakes import (
+    BIAS,
     GAINS,
     MISTAKES,
     MOST_DB,
@@ -200,6 +201,8 @@ def test_a_roughness_that_is_only_biased_has_no_other_curve(found: np.ndarray, s
     records = of_roughness(found)
     name = "if_root" if found.mean() < LEVELS.mean() else "if_decoded"
     gains = [record.values[metric_key("roughness", GAINS[name])] for record in records]
+    biases = [record.values[metric_key("roughness", BIAS)] for record in records]
+    assert min(biases) >= BIAS.perfect, "or no file of results could have it"
     if not said:
         assert sum(gain > 0 for gain in gains) > MOST * len(gains)
         assert np.mean(gains) > MISTAKES[name].least

@@ -72,7 +72,8 @@ GAINS: Mapping[str, Metric] = {
     for name, mistake in MISTAKES.items()
 }
 
-BIAS = Metric("bias", "bias", "", LOWER, 0.0, (), 4, "masked mean of p - t, of a stranger's answer")
+# Signed: no file of results may have a value below `perfect`.
+BIAS = Metric("bias", "bias", "", LOWER, -1.0, (), 4, "masked mean of p - t, of a stranger's answer")
 AT_WHITE = Metric(
     "at_white",
     "at white",
