@@ -51,7 +51,7 @@ class BenchReport:
         from unirender_evaluation.runs.report import rebuild
 
         path = rebuild(self.folder, self.suite, asked_variants(self.variant))
-        print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+        print(f"report: {path} ({path.stat().st_size / 1e6:.1f} MB)")
         return 0
 
 
@@ -79,7 +79,9 @@ class BenchExport:
 
         with new_folder(self.out) as folder:
             count = export_inputs(load_suite(self.suite), folder, self.limit)
-        print(f"{self.out}: {count} questions")
+        limit = "" if self.limit is None else f" --limit {self.limit}"
+        scores = f"`unirender bench run --suite {self.suite}{limit} --predictions NAME=FOLDER` scores the answers"
+        print(f"{count} questions about the pictures in {self.out}; {scores}")
         return 0
 
 

@@ -1,6 +1,6 @@
 """Every table that a run fills, and every metric that stands in one or is recorded beside it."""
 
-from unirender_evaluation.methods.mistakes import GAINS
+from unirender_evaluation.methods.mistakes import AT_WHITE, BIAS, GAINS
 from unirender_evaluation.metrics import METRICS, Metric
 from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE
 from unirender_evaluation.physics.tests import PHYSICS_TABLE
@@ -13,4 +13,5 @@ ALL_METRICS: dict[str, Metric] = {
     **{column.metric.name: column.metric for spec in ALL_TABLES.values() for column in spec.columns},
     **METRICS,
     **GAINS,
+    **{metric.name: metric for metric in (BIAS, AT_WHITE)},
 }

@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -20,6 +21,7 @@ from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.statistics import Estimate, holm, light_count, paired_p_value
 from unirender_evaluation.task import LIGHT
 
+ORDER = ("FAILS", "open", "HOLDS", "stated")
 FEW = 20  # objects or lights: a claim that is not shown of fewer is open, of as many it fails
 
 
@@ -153,7 +155,7 @@ HEAD = (
 
 
 def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, lights: Lights | None = None) -> str:
-    """The verdict section: claims, ceiling, truth check; one line each.
+    """The verdict section: claims, those that fail first, ceiling, truth check; one line each.
 
     Args:
         records: of the run.
@@ -163,7 +165,8 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, li
     """
     lines = [f"Verdict on suite {run.suite} ({HEAD})"]
     found = judged(records, run, lights)
-    lines += [f"  {finding}" for finding in found]
+    lines += [f"  {line}" for line in _counts_line(found)]
+    lines += [f"  {finding}" for finding in sorted(found, key=_place)]
     lines += [f"  ({line})" for line in summary(found)]
     lines += ceiling_lines(records)
     told = "what its check found stands in the run's verdict.txt"
@@ -172,6 +175,18 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, li
     if run.limit is not None:
         lines.append(f"  (--limit {run.limit}: a partial run, not a result)")
     return "\n".join(lines)
+
+
+def _place(finding: Finding) -> int:
+    """Where a claim stands among the others: those that fail before those that hold, what claims nothing last."""
+    return len(ORDER) if finding.comparison is None else ORDER.index(finding.word)
+
+
+def _counts_line(found: Sequence[Finding]) -> list[str]:
+    """How many lines begin with each word; nothing where there is none."""
+    words = Counter(finding.word for finding in found if finding.comparison is not None)
+    counted = [*(f"{word} {words[word]}" for word in ORDER), f"not compared {len(found) - words.total()}"]
+    return [f"({', '.join(counted)})"] if found else []
 
 
 def judged(records: Sequence[Record], run: RunInfo, lights: Lights | None) -> list[Finding]:

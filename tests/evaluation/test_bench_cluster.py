@@ -108,16 +108,17 @@ class SlowFirst:
         return Answer(self, scene, next(iter(wanted)))
 
 
-class Answer:
+class Answer(cluster.ClusterFuture):
     """What it promises of one scene: one record, one picture."""
 
     def __init__(self, executor: SlowFirst, scene: str, key: str) -> None:
+        super().__init__(None)
         self.executor, self.scene, self.key = executor, scene, key
 
     def done(self) -> bool:
         return self.scene != "s0" or len(self.executor.taken) == self.executor.scenes - 1
 
-    def result(self) -> tuple[list[Record], dict[str, bytes]]:
+    def result(self, timeout: float | None = None) -> tuple[list[Record], dict[str, bytes]]:
         assert self.done(), "waits for one scene while others are done"
         self.executor.open.remove(self.scene)
         self.executor.taken.append(self.scene)

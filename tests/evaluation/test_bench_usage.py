@@ -16,6 +16,7 @@ from unirender.cli import main
 from unirender.errors import UnirenderError
 from unirender.models.precision import resolve_device
 from unirender_evaluation.metrics import chosen_variants
+from unirender_evaluation.records import Record
 from unirender_evaluation.runs.benchmark import run
 from unirender_evaluation.runs.command import BenchRun, print_verdict, shown_tables
 from unirender_evaluation.runs.config import BenchConfig, build_rows
@@ -202,8 +203,8 @@ def test_repeated_options_add_up(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "variants", "shown"),
     [
-        ("trivial", (), ["inverse whole"]),
-        ("external", (), ["inverse whole", "relighting masked"]),
+        ("trivial", (), ["inverse whole", "inverse masked"]),
+        ("external", (), ["inverse whole", "inverse masked", "relighting masked"]),
         ("trivial", ("masked", "masked-aligned"), ["inverse masked", "inverse masked"]),
     ],
 )
@@ -213,9 +214,7 @@ def test_a_run_prints_the_papers_tables_and_those_that_a_row_of_yours_answers(
     """Relighting by an HDRI is none of the paper's protocols."""
     run_info = replace(RUN, methods=tuple(replace(info, kind=kind) for info in RUN.methods))
     tables = build_tables(small_records(), run_info, ALL_TABLES, chosen_variants(variants))
-    found = shown_tables(tables, all_variants=bool(variants))
-    assert [f"{table.name} {table.variant.mask}" for table in found] == shown
-    assert len(found) < len(tables)
+    assert [f"{table.name} {table.variant.mask}" for table in shown_tables(tables)] == shown
 
 
 def test_a_run_of_your_row_alone_prints_what_it_answers() -> None:
@@ -223,7 +222,21 @@ def test_a_run_of_your_row_alone_prints_what_it_answers() -> None:
     run_info = replace(RUN, methods=(replace(RUN.methods[0], kind="external"), *RUN.methods[1:]))
     tables = build_tables(records, run_info, ALL_TABLES)
     assert [table.name for table in tables] == ["inverse", "inverse", "relighting"]
-    assert [table.name for table in shown_tables(tables, all_variants=False)] == ["relighting"]
+    assert [table.name for table in shown_tables(tables)] == ["relighting"]
+
+
+@pytest.mark.parametrize("kind", ["ours", "trivial", "external"])
+def test_a_run_prints_the_physics_of_its_rows(kind: Literal["ours", "trivial", "external"]) -> None:
+    """Of bounds alone beside a row of yours it says nothing of that row."""
+    values = {"composite_input.psnr@masked-srgb-raw": 30.0}
+    ours, *others = RUN.methods
+    run_info = replace(RUN, methods=(replace(ours, kind=kind), *others))
+    records = [*small_records(), Record("physics", "physics", "noise-ceiling", "s0", "o0", values)]
+    tables = build_tables(records, run_info, ALL_TABLES)
+    assert tables[-1].name == "physics"
+    assert (tables[-1] in shown_tables(tables)) == (kind != "external")
+    tables = build_tables([*records, Record("physics", "physics", ours.key, "s0", "o0", values)], run_info, ALL_TABLES)
+    assert shown_tables(tables)[-1] == tables[-1]
 
 
 @pytest.mark.parametrize(
@@ -238,5 +251,13 @@ def test_the_verdict_has_a_line_for_each_claim_or_is_set_below_its_beginning(
 ) -> None:
     out = StringIO()
     console = Console(file=out, width=24, force_terminal=terminal, color_system=None)
-    print_verdict(console, "verdict\n  HOLDS  a claim of many words beats another")
+    print_verdict(console, "verdict\n  HOLDS  a claim of many words beats another", Path("run"))
     assert out.getvalue().splitlines() == expected
+
+
+def test_lines_of_the_verdict_that_claim_nothing_are_counted() -> None:
+    out = StringIO()
+    lines = ["verdict", "  FAILS  a", "  open   b", "  HOLDS  c", "  stated d", "  not run e", "  infinite PSNR, not f"]
+    print_verdict(Console(file=out, width=80), "\n".join(lines), Path("run"))
+    folded = "  (2 more lines, which claim nothing: run/verdict.txt)"
+    assert out.getvalue().splitlines() == [*lines[:4], lines[-1], folded]

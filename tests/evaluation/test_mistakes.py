@@ -10,15 +10,20 @@ from unirender.intrinsics import Intrinsics
 from unirender.light.environment import environment_directions
 from unirender_evaluation.light_metrics import scaled_log_rmse
 from unirender_evaluation.methods.mistakes import (
+    BIAS,
     GAINS,
+    MISTAKES,
     MOST_DB,
     colour_gains,
+    light_facts,
     light_gains,
     normal_gains,
+    roughness_facts,
     roughness_gains,
 )
+from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.records import Record
-from unirender_evaluation.tables.mistakes import LEAST_DB, MOST, mistakes_said, truth_said
+from unirender_evaluation.tables.mistakes import LEAST_DB, MOST, brightness_said, mistakes_said, truth_said
 
 RNG = np.random.default_rng(0)
 COLOUR, LIGHT = RNG.random((12, 14, 3)).astype(np.float32), RNG.random((16, 32, 3)).astype(np.float32)
@@ -82,6 +87,24 @@ def test_normals_tell_side_signs_and_axes(mistake: str, found: np.ndarray) -> No
     assert only(normal_gains(3 * found, NORMAL, WHOLE)) == [mistake], "of any length"
 
 
+@pytest.mark.parametrize("columns", [slice(7, 21), slice(8, 12)])
+def test_a_crop_that_fills_the_frame_is_told(columns: slice) -> None:
+    """The box around the object, or the square around that box, twice as large as in the truth."""
+    rows, side = slice(6, 18), 6
+    mask = np.zeros((24, 28, 1), np.float32)
+    mask[rows, columns] = 1
+    if columns.stop - columns.start < 12:  # narrower than high
+        mask, columns = mask[:, :24], slice(10 - side, 10 + side)
+    size = (mask.shape[0], mask.shape[1], 3)
+    colour, normal = RNG.random(size).astype(np.float32), RNG.normal(size=size).astype(np.float32)
+
+    def crop(x: np.ndarray) -> np.ndarray:
+        return x[rows, columns].repeat(2, axis=0).repeat(2, axis=1)
+
+    assert only(colour_gains(crop(colour), colour, mask)) == ["if_in_box"]
+    assert only(normal_gains(crop(normal), normal, mask)) == ["if_in_box"]
+
+
 COVERAGE = np.where(RNG.random((12, 14, 1)) < 0.5, 1, RNG.uniform(0.4, 0.8, (12, 14, 1))).astype(np.float32)
 
 
@@ -131,7 +154,9 @@ def test_a_gain_is_the_ratio_of_squared_errors_in_db() -> None:
 
 def test_above_white_all_is_alike() -> None:
     found, true = (np.where(COLOUR > 0.8, np.float32(white), COLOUR) for white in (9, 3))
-    assert max(colour_gains(found, true, WHOLE).values()) == -MOST_DB
+    gains = colour_gains(found, true, WHOLE)
+    assert gains.pop("if_in_box") == 0, "the box is the frame"
+    assert max(gains.values()) == -MOST_DB
 
 
 def test_decoded_and_encoded_albedos_are_told_apart() -> None:
@@ -145,6 +170,44 @@ def answers(mistake: str, gains: Sequence[float], quantity: str = "albedo", obje
         Record("inverse", "single-image", "m", f"s{i}", f"o{i % objects}", {f"{quantity}.{mistake}": gain})
         for i, gain in enumerate(gains)
     ]
+
+
+LEVELS = np.linspace(0.05, 0.95, 12)  # true roughness of as many objects
+
+
+def of_roughness(found: np.ndarray) -> list[Record]:
+    """A picture of each level."""
+    mask, records = np.ones((2, 2, 1), np.float32), []
+    for i, levels in enumerate(zip(found, LEVELS, strict=True)):
+        p, t = (Intrinsics(roughness=np.full((2, 2, 1), level, np.float32)) for level in levels)
+        gains = {metric_key("roughness", GAINS[name]): gain for name, gain in roughness_gains(p, t, mask).items()}
+        values = {metric_key("roughness", "mse"): (levels[0] - levels[1]) ** 2, **roughness_facts(p, t, mask), **gains}
+        records.append(Record("inverse", "single-image", "m", f"r{i}", f"o{i}", values))
+    return records
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (srgb_encode(LEVELS), "taken for display values"),
+        (1 - LEVELS, "taken for 1 minus it"),
+        (LEVELS**2, "as its square root"),
+        (np.minimum(LEVELS + 0.2, 1), ""),
+        (np.maximum(LEVELS - 0.2, 0), ""),
+    ],
+)
+def test_a_roughness_that_is_only_biased_has_no_other_curve(found: np.ndarray, said: str) -> None:
+    """Though it, too, is nearer to the truth when it is decoded, or as its root, on most pictures by a lot."""
+    records = of_roughness(found)
+    name = "if_root" if found.mean() < LEVELS.mean() else "if_decoded"
+    gains = [record.values[metric_key("roughness", GAINS[name])] for record in records]
+    biases = [record.values[metric_key("roughness", BIAS)] for record in records]
+    assert min(biases) >= BIAS.perfect, "or no file of results could have it"
+    if not said:
+        assert sum(gain > 0 for gain in gains) > MOST * len(gains)
+        assert np.mean(gains) > MISTAKES[name].least
+    assert said in mistakes_said(records)
+    assert bool(mistakes_said(records)) == bool(said)
 
 
 @pytest.mark.parametrize(
@@ -190,7 +253,7 @@ def test_of_each_quantity_the_mistake_is_said_that_explains_most() -> None:
     ]
     said = "with red and blue exchanged (BGR?): albedo (4 of 4, +7.0 dB), d (12 of 12, +5.0 dB)"
     assert mistakes_said(records) == f"its answers are nearer to the truth {said}"
-    more = mistakes_said([*records, *answers("if_inverted", [9.0] * 4, "roughness")])
+    more = mistakes_said([*records, *of_roughness(1 - LEVELS)])
     assert more.startswith(f"its answers are nearer to the truth {said}, and taken for 1 minus it")
 
 
@@ -218,6 +281,21 @@ def test_maps_are_the_truth_above_50_db_or_below_half_a_degree() -> None:
     assert told([51.0] * 3 + [49.0] * 9, *psnr) == ""
     assert ": normal (4 of 5 pictures) " in told([0.4] * 4 + [0.6], *angle)
     assert told([0.4] * 3 + [0.6] * 9, *angle) == ""
+
+
+def lights(brightest: Sequence[float], true: float = 9.0) -> list[Record]:
+    """A picture for each light."""
+    truth = np.full((16, 32, 3), true, np.float32)
+    made = [light_facts(np.full((16, 32, 3), value, np.float32), truth) for value in brightest]
+    return [Record("light", "light-from-image", "m", f"s{i}", f"o{i}", values) for i, values in enumerate(made)]
+
+
+def test_lights_of_8_bits_end_at_white() -> None:
+    said = "its lights end at 1, where the true ones are brighter: 4 of 5 pictures (of 8 bits?)"
+    assert brightness_said(lights([1.0, 1.0, 0.95, 1.0, 7.0])) == said
+    assert brightness_said(lights([1.0] * 4, true=1.5)) == "", "the true ones end there, too, or nearly"
+    for others in ([1.0] * 3, [1.0] * 3 + [7.0], [1.0] * 4 + [7.0, 0.5], [0.7, 0.8, 2.0, 0.6, 3.0]):
+        assert brightness_said(lights(others)) == ""
 
 
 def test_a_light_that_knows_nothing_has_not_been_turned() -> None:

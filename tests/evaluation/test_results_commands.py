@@ -98,6 +98,10 @@ def test_a_table_may_have_some_rows_and_columns_alone(bench, files: tuple[Path, 
     assert status == 0
     assert [row["label"] for row in made["rows"]] == ["input as albedo"]
     assert {column["metric"]["name"] for column in made["columns"]} == {"mse"}
+    about = "One image in; maps out. Metallic, roughness and normal are always taken inside the mask."
+    assert made["notes"][0] == about
+    (made,) = json.loads(bench(*asked, "--table", "inverse", "--metric", "psnr")[1])
+    assert made["notes"][0] == "One image in; maps out.", "of columns that are not there nothing is said"
     wrong = (
         (("--method", "Ours-Meen"), "did you mean ours-mean"),
         (("--metric", "PSNR"), "did you mean psnr"),

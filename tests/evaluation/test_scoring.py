@@ -113,6 +113,13 @@ def premultiplied(maps: Intrinsics) -> Intrinsics:
     return maps.replace(albedo=found["albedo"] * found["mask"])
 
 
+def cropped(maps: Intrinsics) -> Intrinsics:
+    """The box around the object stretched to the frame, by the nearest pixel."""
+    rows = np.flatnonzero(np.any(maps.require("mask")["mask"] > 0, axis=(1, 2)))
+    seen = rows[0] + ((np.arange(SIZE) + 0.5) * len(rows) / SIZE).astype(int)
+    return maps.replace(albedo=maps.require("albedo")["albedo"][seen][:, seen])
+
+
 MADE: dict[
     str, tuple[str, Callable[[Intrinsics], Intrinsics]]
 ] = {  # mistake -> the quantity that tells, how it is made
@@ -123,6 +130,7 @@ MADE: dict[
     "if_mirrored": ("normal", changed("normal", lambda x: x[:, ::-1] * np.array([-1, 1, 1], np.float32))),
     "if_upside_down": ("diffuse", changed("diffuse", lambda x: x[::-1])),
     "if_shifted": ("albedo", changed("albedo", lambda x: np.roll(x, 1, 0))),
+    "if_in_box": ("albedo", cropped),
     "if_y_down": ("normal", changed("normal", lambda x: x * np.array([1, -1, 1], np.float32))),
     "if_opencv": ("normal", changed("normal", lambda x: x * np.array([1, -1, -1], np.float32))),
     "if_x_left": ("normal", changed("normal", lambda x: x * np.array([-1, 1, 1], np.float32))),
@@ -145,8 +153,8 @@ def test_a_usual_mistake_that_is_undone_gains_most(mistake: str) -> None:
     """Whichever it is, the note names it and no other; of three pictures it says nothing."""
     quantity, make = MADE[mistake]
     truth = intrinsics(0).replace(diffuse=intrinsics(1).diffuse)
-    values = suspicions(asked(truth), None, make(truth))
-    gains = {key: gain for key, gain in values.items() if key.startswith(f"{quantity}.")}
+    values = score_maps(make(truth), truth) | suspicions(asked(truth), None, make(truth))
+    gains = {key: gain for key, gain in values.items() if key.startswith(f"{quantity}.if_")}
     assert gains.pop(metric_key(quantity, GAINS[mistake])) == MOST_DB
     assert max(gains.values(), default=0) < 15
     records = [Record("inverse", "single-image", "m", f"s{i}", f"o{i}", values) for i in range(4)]
@@ -158,7 +166,7 @@ def test_a_usual_mistake_that_is_undone_gains_most(mistake: str) -> None:
 
 def test_what_is_sound_gains_nothing() -> None:
     truth = intrinsics(0).replace(diffuse=intrinsics(1).diffuse)
-    assert max(suspicions(asked(truth), None, truth).values()) < 0
+    assert max(gain for key, gain in suspicions(asked(truth), None, truth).items() if ".if_" in key) < 0
     albedo = truth.require("albedo")["albedo"]
     noise = np.random.default_rng(2).normal(0, 0.2, (*albedo.shape[:2], 1))
     noisy = truth.replace(albedo=np.clip(albedo + noise, 0, 1))

@@ -229,7 +229,7 @@ def test_broken_meshes_and_lights_are_named_and_nothing_is_made(tmp_path: Path) 
     assert "has no faces" in reasons[0]
     assert "covers no pixel" in reasons[1]
     assert str(tmp_path) not in "".join(reasons)
-    spec.path.write_text(suite_path("tiny").read_text() + MESHES)
+    spec.path.write_text(suite_path("tiny").read_text().replace('name = "tiny"', 'name = "my"') + MESHES)
     with pytest.raises(UnirenderError, match=r"(?s)2 of its meshes cannot be used.*a\.obj.*flat\.obj"):
         next(make_truth(spec.path, tmp_path / "work"))
     assert not (tmp_path / "work").exists()
@@ -489,7 +489,7 @@ def test_a_folder_beside_the_suites_file_moves_with_it(tmp_path: Path, monkeypat
     write_meshes(mine / "models", ["a.obj"])
     write_meshes(elsewhere, ["a.obj"])
     source = mine / "mine.toml"
-    source.write_text(suite_path("tiny").read_text() + "\n[[meshes]]\n")
+    source.write_text(suite_path("tiny").read_text().replace('name = "tiny"', 'name = "mine"') + "\n[[meshes]]\n")
     monkeypatch.chdir(tmp_path)
     for out, given, written in (
         (None, Path("mine/models"), "models"),
@@ -502,6 +502,28 @@ def test_a_folder_beside_the_suites_file_moves_with_it(tmp_path: Path, monkeypat
         folder = spec.folder("objects")
         assert folder is not None
         assert (folder / "a.obj").is_file()
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "refused"),
+    [
+        ("paper.toml", ("", ""), False),  # as --out writes it
+        ("mine.toml", ("", ""), True),
+        ("paper.toml", ("resolution = 1024", "resolution = 64"), True),
+        ("mine.toml", ('name = "paper"', 'name = "mine"'), False),
+    ],
+)
+def test_another_suite_under_a_name_of_the_package_is_refused(
+    tmp_path: Path, file: str, change: tuple[str, str], refused: bool
+) -> None:
+    path = tmp_path / file
+    path.write_text(suite_path("paper").read_text().replace(*change, 1))
+    for look in (found_spec, target):
+        if refused:
+            with pytest.raises(UnirenderError, match=rf"{file}: name is 'paper', that of a suite of the package"):
+                look(path)
+        else:
+            look(path)
 
 
 def test_folders_are_refused_where_they_are_not_used_or_not_there(tmp_path: Path) -> None:

@@ -155,7 +155,7 @@ def test_a_suite_whose_hash_cannot_be_written_is_refused(body: str, count: int, 
 
 
 def test_nothing_is_rendered_for_a_suite_whose_hash_cannot_be_written(tmp_path: Path) -> None:
-    path = tmp_path / "odd.toml"
+    path = tmp_path / "tiny.toml"
     path.write_text(suite_path("tiny").read_text().replace("\nsha256 =", '\n"sha256" ='))
     with pytest.raises(UnirenderError, match="got 0 lines"):
         next(make_truth(path, tmp_path / "work"))
@@ -308,6 +308,7 @@ def test_the_papers_protocol_runs_on_a_folder_of_meshes_and_pictures(tmp_path: P
         Image.fromarray(rng.integers(0, 256, (16, 24, 3), np.uint8)).save(lights / f"{name}.png")
     text = suite_path("paper").read_text()
     changes = {
+        "name": '"small"',
         "resolution": "32",
         "light_rows": "8",
         "per_scene": "1",
@@ -323,7 +324,7 @@ def test_the_papers_protocol_runs_on_a_folder_of_meshes_and_pictures(tmp_path: P
     def make(out: str) -> Suite:
         folders = {"objects": models, "lights": lights, "out": tmp_path / out}
         assert len(list(make_truth(tmp_path / "small.toml", tmp_path / "work", 2, **folders))) == 2
-        return load_suite(tmp_path / out / "paper.toml")
+        return load_suite(tmp_path / out / "small.toml")
 
     suite = make("first")
     assert (tmp_path / "small.toml").read_text() == text, "the suite that is copied stays as it is"

@@ -113,6 +113,10 @@ def test_a_strangers_row_has_claims_of_its_own() -> None:
     assert math.isclose(ceiling.difference.mean, -20)
     assert not {"metallic", "normal", "edit_metallic"} & {quantity for quantity, _ in found}
     text = verdict_text(records, run, CHECK)
+    counts, *lines = text.splitlines()[1:]
+    assert counts == "  (FAILS 1, open 0, HOLDS 1, stated 1, not compared 1)"
+    words = ["FAILS", "HOLDS", "stated"]
+    assert [line.split()[0] for line in lines[:3]] == words, "those that fail first"
     assert "HOLDS  inverse/single-image albedo PSNR: theirs beats input-as-albedo" in text
     assert "FAILS  inverse/single-image albedo PSNR: theirs is beaten by mean-albedo" in text
     assert "theirs is beaten by noise-ceiling, difference -20" in text

@@ -17,12 +17,14 @@ from unirender.light.resampling import resample_environment
 from unirender_evaluation import metrics
 from unirender_evaluation.light_metrics import DIMMEST, SHAPE, scaled_log_rmse
 from unirender_evaluation.methods.method import Mask
-from unirender_evaluation.metrics import LOWER, Metric
+from unirender_evaluation.metrics import LOWER, Metric, metric_key
 
 Map = Float[np.ndarray, "h w c"]
 Light = Float[np.ndarray, "h w 3"]
 EXACT = 1e-9  # error of what is right but for rounding
 MOST_DB = 20.0  # of a gain: a few answers that are exact otherwise do not outvote the others
+WHITE = (0.9, 1.01)  # where the brightest value of a light of 8 bits lies, resampled or not
+BRIGHT = 2.0  # that of a true light which 8 bits do not hold
 TONE, PLACE = 4.0, 1.0  # mean dB that tell: a biased map gains by another scale, too, but by no other side or axes
 
 
@@ -47,6 +49,7 @@ MISTAKES: Mapping[str, Mistake] = {  # by the name of the metric that has the ga
     "if_mirrored": Mistake("mirrored left to right", PLACE),
     "if_upside_down": Mistake("upside down (rows from the bottom?)", PLACE),
     "if_shifted": Mistake("moved by one pixel (cropped or resampled by other rules?)", PLACE),
+    "if_in_box": Mistake("shrunk into the box around the object (a crop that was stretched to the frame?)", PLACE),
     "if_turned": Mistake("turned by half (its middle is behind the camera)", PLACE),
     "if_turned_right": Mistake("rolled by a quarter of its width", PLACE),
     "if_turned_left": Mistake("rolled by three quarters of its width", PLACE),
@@ -68,6 +71,19 @@ GAINS: Mapping[str, Metric] = {
     )
     for name, mistake in MISTAKES.items()
 }
+
+# Signed: no file of results may have a value below `perfect`.
+BIAS = Metric("bias", "bias", "", LOWER, -1.0, (), 4, "masked mean of p - t, of a stranger's answer")
+AT_WHITE = Metric(
+    "at_white",
+    "at white",
+    "",
+    LOWER,
+    0.0,
+    (),
+    2,
+    f"1 where a stranger's light ends at 1, where max t > {BRIGHT:g}",
+)
 
 
 def colour_gains(found: Map, true: Map, mask: Mask) -> dict[str, float]:
@@ -93,6 +109,7 @@ def colour_gains(found: Map, true: Map, mask: Mask) -> dict[str, float]:
         "if_mirrored": [shown[:, ::-1]],
         "if_upside_down": [shown[::-1]],
         "if_shifted": _moved(shown),
+        "if_in_box": _in_boxes(shown, mask),
     }
     if np.any((mask > 0) & (mask < 1)):
         undone["if_edges"] = _other_edges(found, shown, mask)
@@ -113,6 +130,7 @@ def normal_gains(found: Map, true: Map, mask: Mask) -> dict[str, float]:
         "if_mirrored": [found[:, ::-1], found[:, ::-1] * np.array([-1, 1, 1], np.float32)],
         "if_upside_down": [found[::-1], found[::-1] * np.array([1, -1, 1], np.float32)],
         "if_shifted": _moved(found),
+        "if_in_box": _in_boxes(found, mask),
     }
     as_it_is = error(found)
     gains = {name: _gain(as_it_is, map(error, answers)) for name, answers in undone.items()}
@@ -153,6 +171,18 @@ def light_gains(found: Light, true: Float[np.ndarray, "h2 w2 3"]) -> dict[str, f
     return {name: _gain(as_it_is, [error(answer)]) for name, answer in undone.items()}
 
 
+def light_facts(found: Light, true: Float[np.ndarray, "h2 w2 3"]) -> dict[str, float]:
+    """Whether a light ends at white, where the true one is bright; arguments as in `light_gains`."""
+    at_white = float(WHITE[0] <= found.max() <= WHITE[1])
+    return {metric_key("environment", AT_WHITE): at_white} if true.max() > BRIGHT else {}
+
+
+def roughness_facts(found: Intrinsics, true: Intrinsics, mask: Mask) -> dict[str, float]:
+    """By how much roughness is too high."""
+    p, t = found.roughness, true.roughness
+    return {} if p is None or t is None else {metric_key("roughness", BIAS): metrics.weighted_mean(p - t, mask)}
+
+
 def roughness_gains(found: Intrinsics, true: Intrinsics, mask: Mask) -> dict[str, float]:
     """Mistake -> gain in the masked squared error of roughness, or of roughness and metallic together."""
     p, t = found.roughness, true.roughness
@@ -183,6 +213,22 @@ def _other_edges(found: Map, shown: Map, mask: Mask) -> list[Map]:
     in_linear = [found / coverage, (found - white) / coverage]
     as_shown = [multiplied, shown / coverage, (shown - white) / coverage, multiplied / coverage]
     return [*(srgb_encode(np.clip(x, 0, 1)) for x in in_linear), *(np.clip(x, 0, 1) for x in as_shown)]
+
+
+def _in_boxes(x: Map, mask: Mask) -> list[Map]:
+    """A map whose frame becomes the box around the object, or the square around that box."""
+    ends = np.array([np.flatnonzero(np.any(mask > 0, axis=(1 - axis, 2)))[[0, -1]] for axis in (0, 1)])
+    middle, sides = ends.mean(axis=1) + 0.5, ends[:, 1] - ends[:, 0] + 1.0
+    return [_shrunk(x, middle, each) for each in (sides, np.full(2, sides.max()))]
+
+
+def _shrunk(x: Map, middle: Float[np.ndarray, "2"], sides: Float[np.ndarray, "2"]) -> Map:
+    """A map whose frame becomes a box, by the nearest pixel; outside the box its border goes on."""
+    rows, columns = (
+        np.clip(((np.arange(size) + 0.5 - centre) / side + 0.5) * size, 0, size - 1).astype(np.int64)
+        for size, centre, side in zip(x.shape[:2], middle, sides, strict=True)
+    )
+    return x[rows][:, columns]
 
 
 def _moved(x: Map) -> list[Map]:

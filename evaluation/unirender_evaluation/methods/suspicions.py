@@ -6,16 +6,26 @@ It cannot be refused: nothing but its score says so. A note below the tables doe
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from unirender.color import unpremultiply
 from unirender.intrinsics import Intrinsics
-from unirender_evaluation.methods.method import Image
-from unirender_evaluation.methods.mistakes import GAINS, colour_gains, light_gains, normal_gains, roughness_gains
+from unirender_evaluation.methods.method import Image, Mask
+from unirender_evaluation.methods.mistakes import (
+    GAINS,
+    colour_gains,
+    light_facts,
+    light_gains,
+    normal_gains,
+    roughness_facts,
+    roughness_gains,
+)
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.task import Task
 
 
 def suspicions(task: Task, image: Image | None, maps: Intrinsics | None) -> dict[str, float]:
-    """Metric key -> gain in dB of an answer by each usual mistake undone."""
+    """Metric key -> gain in dB of an answer by each usual mistake undone, and what else helps to tell mistakes."""
     values: dict[str, float] = {}
     true, mask = task.truth_maps, task.mask
     if image is not None and task.truth_image is not None:
@@ -23,15 +33,22 @@ def suspicions(task: Task, image: Image | None, maps: Intrinsics | None) -> dict
         values |= _named(task.quantity, colour_gains(*straight, mask))
     if maps is None or true is None:
         return values
-    for name in ("albedo", "specular", "diffuse"):
-        found, truth = getattr(maps, name), getattr(true, name)
-        if found is not None and truth is not None:
-            values |= _named(name, colour_gains(found, truth, mask))
-    if maps.normal is not None and true.normal is not None:
-        values |= _named("normal", normal_gains(maps.normal, true.normal, mask))
+    values |= suspicions_of_maps(maps.maps, true.maps, mask)
     if maps.environment is not None and true.environment is not None:
         values |= _named("environment", light_gains(maps.environment, true.environment))
-    return values | _named("roughness", roughness_gains(maps, true, mask))
+        values |= light_facts(maps.environment, true.environment)
+    return values | _named("roughness", roughness_gains(maps, true, mask)) | roughness_facts(maps, true, mask)
+
+
+def suspicions_of_maps(found: Mapping[str, np.ndarray], true: Mapping[str, np.ndarray], mask: Mask) -> dict[str, float]:
+    """The gains of maps in colour and of normals, as far as both sides have them; straight, colours linear."""
+    values: dict[str, float] = {}
+    for name in ("albedo", "specular", "diffuse", "relit"):
+        if name in found and name in true:
+            values |= _named(name, colour_gains(found[name], true[name], mask))
+    if "normal" in found and "normal" in true:
+        values |= _named("normal", normal_gains(found["normal"], true["normal"], mask))
+    return values
 
 
 def _named(quantity: str, gains: Mapping[str, float]) -> dict[str, float]:

@@ -66,6 +66,10 @@ class Iiw(Scenes):
         found = whdr(answer.maps.albedo, read_judgements(sample.files[1]))
         return {f"{metric_key('albedo', WHDR)}{name.removeprefix('whdr')}": value for name, value in found.items()}
 
+    def suspicions(self, sample: Sample, answer: Answer) -> dict[str, float]:
+        """None: judgements are no map."""
+        return {}
+
     def protocol(self, table: str) -> tuple[tuple[str, str], ...]:
         """(what, value) pairs: what exactly is measured; there is one table."""
         without = sum(not judged for _, judged in self._photographs)

@@ -23,6 +23,7 @@ from PIL import Image
 from unirender.color import image_srgb, srgb_decode
 from unirender.errors import UnirenderError
 from unirender_evaluation.lpips import Lpips
+from unirender_evaluation.methods.suspicions import suspicions_of_maps
 from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.public.metrics import CHROMATICITY, INTENSITY, chromaticity, intensity, segment_means
 from unirender_evaluation.public.scenes import Scenes, scene_sample
@@ -111,6 +112,20 @@ class Maw(Scenes):
             metric_key("albedo", INTENSITY): intensity(*arguments),
             metric_key("albedo", CHROMATICITY): chromaticity(*arguments),
         }
+
+    def suspicions(self, sample: Sample, answer: Answer) -> dict[str, float]:
+        """Of the albedo on the measured surfaces."""
+        if answer.maps is None or answer.maps.albedo is None:
+            return {}
+        colours, labels = measured(sample.files[1], sample.files[2])
+        small = np.asarray(Image.fromarray(labels).resize(SIZE, Image.Resampling.NEAREST))
+        painted = np.concatenate([np.zeros((1, 3)), colours])[np.searchsorted([0, *kinds(labels)], small)]
+        found = suspicions_of_maps(
+            {"albedo": as_compared(answer.maps.albedo)},
+            {"albedo": painted.astype(np.float32)},
+            (small > 0)[..., None].astype(np.float32),
+        )
+        return {key: gain for key, gain in found.items() if not key.endswith("if_in_box")}  # there is no object
 
     def protocol(self, table: str) -> tuple[tuple[str, str], ...]:
         """(what, value) pairs: what exactly is measured; there is one table."""

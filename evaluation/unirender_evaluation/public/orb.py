@@ -34,6 +34,7 @@ from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, read_exr
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.methods.method import quantise
+from unirender_evaluation.methods.suspicions import suspicions_of_maps
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.public import orb_scoring as scoring
 from unirender_evaluation.public.metrics import ERODED, eroded
@@ -177,18 +178,28 @@ class StanfordOrb:
 
     def score(self, sample: Sample, answer: Answer, lpips: Sequence[Lpips]) -> dict[str, float]:
         """The benchmark's metrics of maps, or of a relit picture, each with a factor per channel and without."""
+        mask, truths = self._truths(sample)
+        if sample.asks == "relight":
+            return {} if answer.image is None else scoring.score_relit(answer.image, truths["relit"], mask, lpips)
+        return scoring.score_maps(answer, truths, mask, lpips)
+
+    def suspicions(self, sample: Sample, answer: Answer) -> dict[str, float]:
+        """Of albedo, normals and relit pictures, inside the mask that counts."""
+        mask, truths = self._truths(sample)
+        found = {} if answer.maps is None else dict(answer.maps.maps)
+        found |= {} if answer.image is None else {"relit": answer.image}
+        return suspicions_of_maps(found, truths, eroded(mask))
+
+    def _truths(self, sample: Sample) -> tuple[Float[np.ndarray, "h w 1"], dict[str, Float[np.ndarray, "h w c"]]]:
+        """The mask of a sample, and what its answer is compared with."""
         if sample.asks == "relight":
             frame = self._relit[sample.key][1]
-            if answer.image is None:
-                return {}
-            mask, path = self._mask(frame), frame.photo(self.folder, HDR)
-            truth = self._reduced(read_radiance(path), path, frame)
-            return scoring.score_relit(answer.image, truth, mask, lpips)
+            path = frame.photo(self.folder, HDR)
+            return self._mask(frame), {"relit": self._reduced(read_radiance(path), path, frame)}
         frame = self._tests[sample.key]
         mask = self._mask(frame)
         found = frame_truths(self.folder, frame)
-        truths = {name: self._truth(name, path, frame, eroded(mask)) for name, path in found.items()}
-        return scoring.score_maps(answer, truths, mask, lpips)
+        return mask, {name: self._truth(name, path, frame, eroded(mask)) for name, path in found.items()}
 
     def _mask(self, frame: Photograph) -> Float[np.ndarray, "h w 1"]:
         path = frame.mask(self.folder)

@@ -35,6 +35,7 @@ from unirender_evaluation.subsets import partial as partial_limit
 from unirender_evaluation.tables.build import Table
 from unirender_evaluation.tables.formats import print_tables, to_json, to_markdown
 from unirender_evaluation.tables.latex import to_latex
+from unirender_evaluation.tables.protocol import with_doubts
 from unirender_evaluation.versions import LPIPS, SEPARATOR, Versions, installed_version, modules_version, versions
 from unirender_reference.folder_lock import locked, made_folder
 
@@ -183,6 +184,8 @@ def _work(what: PublicRun, sample: Sample, content: str, store: Store) -> None:
         else:
             answer, seconds = asked(row, sample, inputs)
         values = what.public.score(sample, answer, networks)
+        if row.info.kind == "external":
+            values |= what.public.suspicions(sample, answer)
         name = row.info.key
         store.add(Record(sample.table, sample.protocol, name, sample.key, sample.object, values, key, seconds=seconds))
 
@@ -193,7 +196,7 @@ def _info(what: PublicRun, records: Sequence[Record], contents: Sequence[str]) -
         suite=what.public.name,
         suite_hash=hashlib.sha256("".join(contents).encode()).hexdigest(),
         resolution=what.public.resolution,
-        methods=tuple(row.info for row in what.rows if row.info.key in used),
+        methods=tuple(with_doubts(row.info, records) for row in what.rows if row.info.key in used),
         exposure="of the photographs",
         lpips=what.backbones,
         code=what.versions.code[:12],

@@ -115,6 +115,10 @@ class PublicSet(Protocol):
         """Metric key -> value. Raises UnirenderError where a file of the truth is broken."""
         ...
 
+    def suspicions(self, sample: Sample, answer: Answer) -> dict[str, float]:
+        """Metric key -> gain in dB of an answer by each usual mistake undone; nothing where the truth tells none."""
+        ...
+
     def unit(self, sample: str) -> str:
         """What of `averaged_first` the sample of that key belongs to; the key itself where there is nothing."""
         ...

@@ -57,7 +57,7 @@ from unirender_evaluation.store import KEPT, Job, Store
 from unirender_evaluation.suites.suite import load_suite
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables.build import Table, build_tables
-from unirender_evaluation.tables.protocol import doubts, mask_source
+from unirender_evaluation.tables.protocol import mask_source, with_doubts
 from unirender_evaluation.tasks import scene_ids
 from unirender_evaluation.truth.make import quality_summary
 from unirender_evaluation.verdict import verdict_text
@@ -69,13 +69,15 @@ FEW = 100  # records: fewer are not worth starting processes
 
 @dataclass(frozen=True)
 class BenchResult:
-    """What a run has found; `computed` counts the records that were not there before."""
+    """What a run has found; it `asked` for so many records and `computed` those that were not there, as its dry run
+    counts them: without those of the truth check."""
 
     records: tuple[Record, ...]
     run: RunInfo
     tables: tuple[Table, ...]
     verdict: str
     truth_check: dict[str, Any]
+    asked: int
     computed: int
 
 
@@ -105,11 +107,11 @@ def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
     missing = missing_answers(suite, here.rows, here.scenes)
     write_missing(config.out, missing)
     say_missing(config.out, missing, say, "has files for")
-    before = set(store.known)
     with progress_bar(console) as progress:
         check = run_check(request, here, store, progress, say)
-        _work(here, config, store, progress)
-        _optimise_views(here, config, store, progress)
+        of_check = set(store.used)
+        computed = _work(here, config, store, progress) + _optimise_views(here, config, store, progress)
+    asked = len(store.used.keys() - of_check)
     records = [record for record in store.close() if record.values]
     without = unanswered(suite, here.rows, here.scenes, records)
     write_missing(config.out, without)
@@ -124,7 +126,7 @@ def _run(config: BenchConfig, here: Run, console: Console) -> BenchResult:
     tables = build_tables(records, info, ALL_TABLES, config.variants)
     lights = sample_lights(suite)
     verdict = verdict_text(records, info, check, lights)
-    result = BenchResult(tuple(records), info, tuple(tables), verdict, check, len({r.key for r in records} - before))
+    result = BenchResult(tuple(records), info, tuple(tables), verdict, check, asked, computed)
     write_outputs(config.out, result)
     report_run(config.out, suite, info, records, tables)
     write_results(config.out / RESULTS, info, records, lights)
@@ -150,9 +152,9 @@ def check_request(config: BenchConfig) -> CheckRequest:
     return CheckRequest(config.out / "truth_check.json", config.check_scenes, config.check_seed, config.recheck)
 
 
-def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> None:
+def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> int:
     """Computes the records that are missing: on a cluster if there is one, else few of them here, many in worker
-    processes."""
+    processes. Returns how many."""
     bar = progress.add_task("methods", total=None)
     wanted: dict[str, frozenset[str]] = {}  # keys and not jobs, which hold the pictures of their scene
     for scene in here.scenes:
@@ -161,7 +163,7 @@ def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> N
     scenes.sort(key=lambda scene: -len(wanted[scene.key]))  # those with slow rows first: none is left for the end
     if not scenes:
         progress.remove_task(bar)
-        return  # a finished run needs no cluster to write its tables again
+        return 0  # a finished run needs no cluster to write its tables again
     wanted = {scene.key: wanted[scene.key] for scene in scenes}
     total = sum(map(len, wanted.values()))
     progress.update(bar, total=total)
@@ -169,7 +171,7 @@ def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> N
         for job in (job for scene in scenes for job in here.jobs(scene) if job.key in wanted[scene.key]):
             store.add(job.make())
             progress.update(bar, advance=1, description=job.label)
-        return
+        return total
     if config.cluster is not None:
         found = run_on_cluster(here, partial(build_rows, config), config.suite, wanted, config.cluster)
     else:
@@ -180,6 +182,7 @@ def _work(here: Run, config: BenchConfig, store: Store, progress: Progress) -> N
             for record in records:
                 store.add(record)
             progress.advance(bar, len(records))
+    return total
 
 
 def _views_rows(config: BenchConfig) -> list[Row]:
@@ -199,14 +202,16 @@ def views_jobs(here: Run, config: BenchConfig) -> list[Job]:
     ]
 
 
-def _optimise_views(here: Run, config: BenchConfig, store: Store, progress: Progress) -> None:
-    """The multi-view table: one optimisation after another, in this process, since their seconds are part of it."""
+def _optimise_views(here: Run, config: BenchConfig, store: Store, progress: Progress) -> int:
+    """The multi-view table: one optimisation after another, in this process, since their seconds are part of it.
+    Returns how many."""
     missing = [job for job in views_jobs(here, config) if not job.is_done(store.has)]
     bar = progress.add_task("multi-view", total=len(missing), visible=bool(missing))
     for job in missing:
         progress.update(bar, description=job.label)
         store.add(job.make())
         progress.advance(bar)
+    return len(missing)
 
 
 def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: list[Record]) -> RunInfo:
@@ -248,8 +253,7 @@ def _run_info(config: BenchConfig, here: Run, check: dict[str, Any], records: li
 
 def _described(info: MethodInfo, records: list[Record]) -> MethodInfo:
     """A row with what its records say of it."""
-    note = "; ".join([*filter(None, [info.note]), *doubts(info.key, records)])
-    return replace(info, mask=mask_source(info.key, records), note=note)
+    return replace(with_doubts(info, records), mask=mask_source(info.key, records))
 
 
 def write_outputs(out: Path, result: BenchResult) -> None:

@@ -9,7 +9,6 @@ from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 from uuid import uuid4
 
 from unirender.errors import UnirenderError
@@ -20,6 +19,7 @@ from unirender_evaluation.runs.workers import Run
 from unirender_evaluation.subsets import Subsets
 from unirender_evaluation.suites.suite import load_suite
 from unirender_evaluation.versions import Versions, versions
+from unirender_reference.cluster import ClusterFuture
 
 AHEAD = 2  # scenes under way for each worker
 PAUSE = 0.1  # seconds between two looks at what is under way; a scene takes many
@@ -95,7 +95,7 @@ def run_on_cluster(
     Raises:
         UnirenderError: as `connect`; a worker cannot do it, or several died over a scene.
     """
-    from unirender_reference.cluster import ClusterFuture, connect
+    from unirender_reference.cluster import connect
 
     order = Order.of(run, build, suite)
     with connect(address) as executor:
@@ -110,7 +110,7 @@ def run_on_cluster(
             yield records
 
 
-def _take_done(under_way: list[Any]) -> Any:
+def _take_done(under_way: list[ClusterFuture]) -> ClusterFuture:
     """Removes the first future that is done, after waiting for one: a slow scene holds up no other."""
     while True:
         for place, future in enumerate(under_way):

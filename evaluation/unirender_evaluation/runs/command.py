@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from unirender_evaluation.tables.build import Table
 
 CLAIM = 9  # columns before a claim of the verdict: whether it holds
+FOLDED = ("  stated ", "  not run ")  # lines of the verdict that claim nothing
 
 
 @dataclass(frozen=True)
@@ -141,40 +142,45 @@ class BenchRun:
         except PredictionError as error:
             print(f"unirender: error: {error}", file=sys.stderr)  # a line for each problem
             return 1
-        shown = shown_tables(result.tables, all_variants=bool(self.variant))
+        shown = shown_tables(result.tables)
         print_tables(console, shown)
-        print_verdict(console, result.verdict)
+        print_verdict(console, result.verdict, self.out)
         if others := [table.heading for table in result.tables if table not in shown]:
             said = f"{len(others)} more tables in {self.out / 'tables.md'} (`unirender bench tables {self.out}`): "
             console.print(said + "; ".join(others), highlight=False, markup=False)
-        console.print(f"{result.computed} new records of {len(result.records)}; report: {self.out / 'report.html'}")
+        checked = " beside the truth check's" if self.check_scenes else ""
+        counts = f"{result.computed} new records of {result.asked}{checked}"
+        console.print(f"{counts}; report: {self.out / 'report.html'}", highlight=False, markup=False)
         return 1 if result.truth_check.get("passed", False) is False else 0
 
 
-def shown_tables(tables: "Sequence[Table]", all_variants: bool) -> "list[Table]":
-    """What a run prints of its tables: all that a row of yours answers, and the paper's protocols, unless your row ran
-    without ours and has no answer there.
-
-    Args:
-        tables: of the run.
-        all_variants: in each variant that they have; else in the first, beside the published values where there are.
-    """
+def shown_tables(tables: "Sequence[Table]") -> "list[Table]":
+    """What a run prints of its tables: all that a row of yours answers; the paper's protocols and the physics, unless
+    your row ran without ours and has no answer there."""
+    from unirender_evaluation.physics.tests import PHYSICS_TABLE
     from unirender_evaluation.tables.specs import PROTOCOLS
 
-    first = {(table.name, table.protocol_key, table.subset): table for table in reversed(tables)}
     kinds = [{row.kind for row in table.rows} for table in tables]
     yours = any("external" in own for own in kinds)
     return [
         table
         for table, own in zip(tables, kinds, strict=True)
-        if (all_variants or table is first[table.name, table.protocol_key, table.subset])
-        and ("external" in own or (PROTOCOLS[table.protocol_key].published and ("ours" in own or not yours)))
+        if "external" in own
+        or (
+            (PROTOCOLS[table.protocol_key].published or table.name == PHYSICS_TABLE.name)
+            and ("ours" in own or not yours)
+        )
     ]
 
 
-def print_verdict(console: "Console", verdict: str) -> None:
-    """A claim on each line; at a terminal that is narrower the rest of it is set below its beginning."""
-    for line in verdict.splitlines():
+def print_verdict(console: "Console", verdict: str, out: Path) -> None:
+    """A claim on each line, without lines that claim nothing; at a terminal that is narrower its rest is set below its
+    beginning."""
+    lines = verdict.splitlines()
+    kept = [line for line in lines if not line.startswith(FOLDED)]
+    if folded := len(lines) - len(kept):
+        kept.append(f"  ({folded} more lines, which claim nothing: {out / 'verdict.txt'})")
+    for line in kept:
         shown = (
             textwrap.fill(line, console.width, subsequent_indent=CLAIM * " ", break_on_hyphens=False)
             if console.is_terminal

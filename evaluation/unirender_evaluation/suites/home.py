@@ -49,9 +49,10 @@ def found_spec(name_or_path: str | Path) -> SuiteSpec:
     """A suite's file with a truth: of a bundled suite without one the copy that was made here, else the shared one.
 
     Raises:
-        UnirenderError: as `read_spec`; or neither is there, or it is of another version of the suite.
+        UnirenderError: as `read_spec` and `check_name`; or neither is there, or it is of another version of the suite.
     """
     spec = read_spec(name_or_path)
+    check_name(spec)
     if not is_bundled(spec.path) or ships_truth(spec):
         return spec
     path = next((place for place in (home(spec.name), shared(spec.name)) if place.is_file()), None)
@@ -69,6 +70,23 @@ def found_spec(name_or_path: str | Path) -> SuiteSpec:
 def definition(spec: SuiteSpec) -> SuiteSpec:
     """What a suite's file says but for the place of its folders and the hash of its truth."""
     return replace(spec, objects_folder="", lights_folder="", objects_from="", lights_from="", truth_sha256="")
+
+
+def check_name(spec: SuiteSpec) -> None:
+    """Looks at the name of a suite, under which its results stand in tables.
+
+    Raises:
+        UnirenderError: it is that of a suite of the package, and the file is neither that nor a copy that `bench truth`
+            wrote of it.
+    """
+    ours = suite_folder() / f"{spec.name}.toml"
+    if is_bundled(spec.path) or not ours.is_file():
+        return
+    if spec.path.stem != spec.name or definition(spec) != definition(read_spec(ours)):
+        raise UnirenderError(
+            f"{spec.path}: name is {spec.name!r}, that of a suite of the package, as which its tables would read; "
+            "expected one of its own, change the line that begins with name"
+        )
 
 
 def truth_command(spec: SuiteSpec) -> str:
@@ -103,11 +121,12 @@ def target(
         objects, lights: folders in place of those that the file names.
 
     Raises:
-        UnirenderError: as `read_spec`; a folder that is not there or that the suite has no use for.
+        UnirenderError: as `read_spec` and `check_name`; a folder that is not there or that the suite has no use for.
     """
     source = suite_path(name_or_path)
     text = read_text(source)
     spec = parse_spec(text, source)
+    check_name(spec)
     path = source
     if out is not None:
         path = out / f"{spec.name}.toml"

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from unirender_evaluation.methods.mistakes import GAINS, MISTAKES, PLACE
+from unirender_evaluation.methods.mistakes import AT_WHITE, BIAS, EXACT, GAINS, MISTAKES, PLACE
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.records import Record
 from unirender_evaluation.statistics import mean_estimate
@@ -26,6 +26,7 @@ TRUE: tuple[tuple[str, str, Callable[[float], bool]], ...] = (  # of maps, which
 )
 MOST = 0.75  # of the pictures that say anything
 LEAST_DB = 0.1  # smaller gains say nothing, as those of a constant or of an object of one colour
+OF_ROUGHNESS = {metric_key("roughness", GAINS[name]) for name in ("if_decoded", "if_inverted", "if_root")}
 FEWEST = 4  # objects whose pictures say something: of fewer it may be chance
 
 
@@ -58,6 +59,27 @@ def truth_said(records: Sequence[Record]) -> str:
     return f"its answers are the truth but for rounding: {', '.join(found)} (was it told?)" if found else ""
 
 
+def brightness_said(records: Sequence[Record]) -> str:
+    """The sentence on lights that end at white; empty where most do not, or they are too few to be noted."""
+    key = metric_key("environment", AT_WHITE)
+    asked = [record for record in records if key in record.values]
+    white = [record.object for record in asked if record.values[key] == 1]
+    if len(set(white)) < FEWEST or len(white) <= MOST * len(asked):
+        return ""
+    return f"its lights end at 1, where the true ones are brighter: {len(white)} of {len(asked)} pictures (of 8 bits?)"
+
+
+def _beyond_bias(key: str, records: Sequence[Record]) -> float:
+    """dB by which a mistake undone is better, over all answers together, than one constant taken from all of them: a
+    roughness that is too high throughout is nearer to the truth when it is decoded, too."""
+    error, bias, gain = (
+        np.array([record.values[name] for record in records])
+        for name in (metric_key("roughness", "mse"), metric_key("roughness", BIAS), key)
+    )
+    undone = (error + EXACT) / 10 ** (gain / 10)
+    return float(10 * np.log10((error.mean() - bias.mean() ** 2 + EXACT) / undone.mean()))
+
+
 def _counts(of_names: Mapping[str, Sequence[Sequence[float]]]) -> str:
     """On how many pictures, and by how much, by the name of the quantity."""
     pooled = {name: np.concatenate(list(gains)) for name, gains in of_names.items()}
@@ -66,13 +88,15 @@ def _counts(of_names: Mapping[str, Sequence[Sequence[float]]]) -> str:
 
 def _likely(quantity: str, records: Sequence[Record]) -> dict[str, list[float]]:
     """Mistake -> its gains that say something, of those that are probably made: by a large mean gain, or, but for
-    roughness, whose bias alone may gain, by a smaller one that other objects would show, too."""
+    roughness, by a smaller one that other objects would show, too; of roughness also beyond its bias."""
     found = {}
     for name, metric in GAINS.items():
         key = metric_key(quantity, metric)
         telling = [record for record in records if abs(record.values.get(key, 0.0)) > LEAST_DB]
         gains, objects = [record.values[key] for record in telling], [record.object for record in telling]
         if len(set(objects)) < FEWEST or sum(g > 0 for g in gains) <= MOST * len(gains):
+            continue
+        if key in OF_ROUGHNESS and _beyond_bias(key, [r for r in records if key in r.values]) <= PLACE:
             continue
         gain = mean_estimate(gains, objects)
         if gain.mean > MISTAKES[name].least or (gain.low > PLACE and quantity != "roughness"):

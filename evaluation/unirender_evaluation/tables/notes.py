@@ -27,7 +27,9 @@ def table_notes(spec: TableSpec, rows: Sequence["Row"], variant: Variant, over_l
         variant: how its numbers are taken.
         over_lights: whether its intervals are over lights, too.
     """
-    notes = [spec.description] if spec.description else []
+    shown = {column.group for column in spec.columns}
+    about = [spec.description, *(remark for remark, groups in spec.remarks if not shown.isdisjoint(groups))]
+    notes = [" ".join(about)] if spec.description else []
     notes += [f"{row.label}: {row.info.note}" for row in rows if row.info is not None and row.info.note]
     if any(row.info and row.label != row.info.label for row in rows):
         notes.append(NAMED)

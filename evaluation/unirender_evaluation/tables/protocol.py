@@ -1,12 +1,13 @@
 """The protocol line: everything one must know to compare a number with one's own."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Literal
 
 from unirender_evaluation.metrics import LPIPS_SCALES, OWN_MASK, Variant
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
 from unirender_evaluation.statistics import CONFIDENCE, CROSSED, METHOD
-from unirender_evaluation.tables.mistakes import mistakes_said, truth_said
+from unirender_evaluation.tables.mistakes import brightness_said, mistakes_said, truth_said
 from unirender_evaluation.tables.published import taken_how
 from unirender_evaluation.tables.specs import Column, Protocol
 
@@ -25,13 +26,18 @@ def mask_source(method: str, records: Iterable[Record]) -> Literal["own", "paste
     return "own" if own else "pasted"
 
 
+def with_doubts(info: MethodInfo, records: Iterable[Record]) -> MethodInfo:
+    """A row whose note says, too, what in its answers is probably a mistake."""
+    return replace(info, note="; ".join([*filter(None, [info.note]), *doubts(info.key, records)]))
+
+
 def doubts(method: str, records: Iterable[Record]) -> list[str]:
     """What a run's records say of a stranger's answers that is probably a mistake, a sentence each, for its note."""
     of_method = [record for record in records if record.method == method]
     own = [record.values for record in of_method]
     empty, masks = sum(values.get(OWN_MASK) == 0 for values in own), sum(OWN_MASK in values for values in own)
     found = [f"its own mask misses the object on {empty} of {masks} pictures (is it 0?)"] if empty else []
-    found += [said for said in (mistakes_said(of_method), truth_said(of_method)) if said]
+    found += [said for judge in (mistakes_said, brightness_said, truth_said) if (said := judge(of_method))]
     return found
 
 

@@ -94,6 +94,7 @@ class TableSpec:
     columns: tuple[Column, ...]
     protocols: tuple[str, ...]  # keys of PROTOCOLS, the paper's first
     description: str = ""
+    remarks: tuple[tuple[str, tuple[str, ...]], ...] = ()  # each with the groups of columns that it is about
 
 
 def _image_columns(group: str, quantity: str, *, ssim: bool = True) -> tuple[Column, ...]:
@@ -125,7 +126,8 @@ TABLES: dict[str, TableSpec] = {
             Column("Mask", "mask", METRICS["iou"], published=False),  # only where some row has one of its own
         ),
         ("single-image",),
-        "One image in; maps out. Metallic, roughness and normal are always taken inside the mask.",
+        "One image in; maps out.",
+        (("Metallic, roughness and normal are always taken inside the mask.", ("Metallic", "Roughness", "Normal")),),
     ),
     "relighting": TableSpec(
         "relighting",

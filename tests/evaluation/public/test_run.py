@@ -5,6 +5,7 @@ import inspect
 import io
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,6 +87,42 @@ def test_a_run_writes_records_and_tables_and_a_second_one_measures_nothing(tmp_p
     assert "\\toprule" in before["tables.tex"].decode()
     assert done(iiw, trivial_rows(iiw), out).computed == 0
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+class Encoded(Ramp):
+    """Display values where linear ones are asked for, and normals with y down."""
+
+    name = "encoded"
+
+    def decompose(self, image_srgb, mask, camera):
+        normal = np.broadcast_to(np.array([0, -0.6, 0.8]), image_srgb.shape)
+        return Intrinsics(albedo=image_srgb, normal=normal, mask=mask, camera=camera)
+
+
+def test_usual_mistakes_of_a_stranger_are_noted(tmp_path: Path) -> None:
+    """By the code of other runs: nearly all pictures of four objects, here categories; not of a trivial row."""
+    folder = make_maw(tmp_path / "maw")
+    meta, photos = folder / "labels" / "meta.csv", folder / "images_png"
+    line = meta.read_text()
+    for name in ("scene_1", "scene_2", "scene_3"):
+        shutil.copytree(photos / "scene_0", photos / name)
+        meta.write_text(meta.read_text() + line.replace("scene_0", name))
+    maw = Maw(folder)
+    result = done(maw, [*trivial_rows(maw), *plugin_rows([Plugin(Encoded(), "test")])], tmp_path / "out")
+    notes = [note for note in result.tables[0].notes if "nearer to the truth" in note]
+    assert [note.split(":")[0] for note in notes] == ["encoded"]
+    assert "taken for display values (encoded? expected linear): albedo (4 of 4, +20.0 dB)" in notes[0]
+    assert not any(".if_" in key for values in of(result, "input-as-albedo").values() for key in values)
+
+
+def test_each_map_of_a_public_set_tells_its_mistakes(tmp_path: Path) -> None:
+    orb = StanfordOrb(make_orb(tmp_path / "orb"), 32)
+    found = of(done(orb, plugin_rows([Plugin(Encoded(), "test")]), tmp_path / "out"), "encoded")
+    maps = found["stanford-orb", "cup_scene001_0000"]
+    gains = {key: value for key, value in maps.items() if key.startswith("normal.if_")}
+    assert gains["normal.if_y_down"] == max(gains.values()) > 0
+    assert "albedo.if_bgr" in maps
+    assert any("relit.if_bgr" in values for values in found.values())
 
 
 def test_only_what_changed_is_measured_again(tmp_path: Path) -> None:
