@@ -1,5 +1,6 @@
 """How a picture of any size comes into the network's square: small objects are cut out."""
 
+import math
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from unirender import blocks
 from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender.light.environment import mean_radiance
-from unirender.pipelines.framing import FAINT, Frame, resize, visible_parts
+from unirender.pipelines.framing import FAINT, FILL, LARGE, Frame, resize, visible_parts
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
 SIZE = 32
@@ -59,7 +60,7 @@ def test_what_fills_the_picture_or_has_the_networks_size_is_left_as_it_is() -> N
 def test_a_picture_that_is_no_square_is_in_the_middle_of_one() -> None:
     wide = np.ones((20, 50, 1), np.float32)
     for picture, corner in ((wide, (-15, 0)), (wide.transpose(1, 0, 2), (0, -15))):
-        frame, rows = Frame.around(picture, 50), np.zeros((50, 50), bool)
+        frame, rows = Frame(*picture.shape[:2], size=50), np.zeros((50, 50), bool)
         rows[15:35] = True
         assert frame.corner == corner
         np.testing.assert_array_equal(frame.enter(picture)[..., 0], rows if corner[0] else rows.T)
@@ -95,7 +96,7 @@ def test_haze_and_stray_pixels_are_left_out_only_where_they_hardly_count() -> No
     cut = Frame.around(mask, SIZE)
     for haze in (1e-4, 1 / 255, FAINT):
         assert Frame.around(np.maximum(mask, np.float32(haze)), SIZE) == cut
-    assert Frame.around(np.maximum(mask, np.float32(FAINT + 0.01)), SIZE).cut is None
+    assert Frame.around(np.maximum(mask, np.float32(FAINT + 0.01)), SIZE) == Frame(128, 128, SIZE, (-16, -16, 160))
     stray = mask.copy()
     stray[0, 0] = 1
     assert Frame.around(stray, SIZE) == cut
@@ -185,3 +186,17 @@ def test_one_column_is_resampled_like_several() -> None:
     column = np.arange(8, dtype=np.float32).reshape(8, 1, 1)
     np.testing.assert_array_equal(resize(column, (4, 1)), resize(np.repeat(column, 3, axis=1), (4, 3))[:, :1])
     assert resize(column, (16, 4)).shape == (16, 4, 1)
+
+
+@pytest.mark.parametrize(("height", "width"), [(SIZE, SIZE), (100, 100), (60, 100)])
+def test_an_object_that_fills_the_picture_is_surrounded(height: int, width: int) -> None:
+    """The network knows no object without a background around it."""
+    mask = np.ones((height, width, 1), np.float32)
+    frame = Frame.around(mask, SIZE)
+    assert frame.side == math.ceil(max(height, width) / FILL)
+    inside = frame.enter(mask)
+    assert inside[[0, -1]].max() == inside[:, [0, -1]].max() == 0
+    assert inside.sum() == pytest.approx(SIZE**2 * FILL**2 * height * width / max(height, width) ** 2, rel=0.05)
+    np.testing.assert_allclose(frame.leave_map(np.ones_like(inside), mask), mask, rtol=0, atol=1e-5)
+    mask[:, : math.ceil(width * (1 - LARGE))] = mask[: math.ceil(height * (1 - LARGE))] = 0
+    assert Frame.around(mask, SIZE).cut is None

@@ -41,6 +41,7 @@ def read_input(
     """
     import numpy as np
 
+    from unirender.picture_files.mask_rim import MIXED, background_share, without_background
     from unirender.pictures import OPAQUE, header_pixels, read_mask_file, read_picture
 
     pixels = header_pixels(path)
@@ -51,6 +52,14 @@ def read_input(
     if mask is not None:
         coverage, lost = read_mask_file(mask, (height, width))
         remarks |= lost
+        opaque = picture.mask is None or picture.mask.min() >= OPAQUE  # so that its colours may have a background
+        if opaque and background_share(picture.image_srgb, coverage) > MIXED:
+            straight = without_background(picture.image_srgb, coverage)
+            picture = dataclasses.replace(picture, image_srgb=straight)
+            remarks["rim"] = (
+                "the picture's background is mixed into the rim of the mask: the colours next to it, further inside, "
+                "are taken there"
+            )
         picture = dataclasses.replace(picture, mask=coverage)
         if coverage.min() >= OPAQUE:
             remarks["mask"] = "the mask covers the whole frame, which is taken as the object"

@@ -1,8 +1,9 @@
-"""Any picture size <-> the model's square: cut out a small object or pad to a square, resample; and back.
+"""Any picture size <-> the model's square: cut out a small object, surround a large one or pad, resample; and back.
 
 Pictures are resampled premultiplied and in linear light, so that no background bleeds in. A picture that has the
-model's size passes through untouched. The square of a large or elongated picture, whose padding may be many times the
-picture, is never there as a whole: along rows and along columns it is resampled in strips, to the same bytes.
+model's size passes through untouched, unless its object fills it. The square of a large or elongated picture, whose
+padding may be many times the picture, is never there as a whole: along rows and along columns it is resampled in
+strips, to the same bytes.
 """
 
 import math
@@ -22,6 +23,7 @@ from unirender.light.resampling import resample_environment
 from unirender.pipelines.masked_maps import divide, unit_normal
 
 SMALL = 2 / 3  # an object whose square has at most this share of the picture's side is cut out
+LARGE = 0.95  # an object that fills more of the longer side is surrounded: it is cut off, or nearly
 FILL = 0.8  # of a square that is cut out; objects of the training data fill 0.7 to 0.9 of theirs
 LEAST_CUT = 8  # pixels along the side of a square that is cut out
 FAINT = 0.05  # coverage up to which nothing counts when an object is cut out: haze of a matte
@@ -50,11 +52,11 @@ class Frame:
 
     @classmethod
     def around(cls, mask: Float[np.ndarray, "h w 1"], size: int) -> "Frame":
-        """The whole picture, or the square around its object where the object is small.
+        """The whole picture, or the square around its object where the object is small, or larger than the picture.
 
         A network sees objects that fill most of the frame; of one that does not, most pixels would be lost on the
-        background. What is left out of the square has no surface: haze of a matte, and stray pixels away from the
-        object that hold hardly any of the coverage (`visible_parts`).
+        background, and objects without any background it has never seen. What is left out of the square has no surface:
+        haze of a matte, and stray pixels away from the object that hold hardly any of the coverage (`visible_parts`).
 
         Args:
             mask: coverage.
@@ -62,10 +64,14 @@ class Frame:
         """
         height, width = mask.shape[:2]
         whole = cls(height, width, size)
-        if whole.identity:
-            return whole
         visible = np.where(mask > FAINT, mask, 0)
-        if not visible.any() or least_extent(visible) > FILL * SMALL * whole.side:  # saves large pictures time
+        if not visible.any():
+            return whole
+        extent = least_extent(visible)
+        if extent > LARGE * whole.side:
+            side = math.ceil(whole.side / FILL)
+            return cls(height, width, size, ((height - side) // 2, (width - side) // 2, side))
+        if whole.identity or extent > FILL * SMALL * whole.side:  # saves large pictures time
             return whole
         first_row, end_row, first_column, end_column = _box(visible[..., 0] > 0)
         seen = visible_parts(visible[first_row:end_row, first_column:end_column])

@@ -1,0 +1,105 @@
+"""The rim of a mask: a background that is mixed into it is found and taken away, straight colours stay."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+from PIL import Image
+from tiny_models import make_pipeline
+
+from unirender.color import image_srgb, srgb_decode
+from unirender.command_line.input_picture import read_input
+from unirender.picture_files.mask_rim import MIXED, background_share, without_background
+
+SIDE = 48
+
+
+def disc() -> Float[np.ndarray, "h w 1"]:
+    """Coverage of a disc, a pixel wide at its rim."""
+    rows, columns = np.mgrid[:SIDE, :SIDE] + 0.5 - SIDE / 2
+    return np.clip(16.3 - np.hypot(rows, columns), 0, 1)[..., None].astype(np.float32)
+
+
+def ball() -> Float[np.ndarray, "h w 3"]:
+    """Straight display values that change over the picture."""
+    rows, columns = np.mgrid[:SIDE, :SIDE] / SIDE
+    return np.stack([0.3 + 0.4 * columns, 0.5 - 0.2 * rows, 0.2 + 0 * rows], axis=-1).astype(np.float32)
+
+
+def over(background: float, linear: bool) -> Float[np.ndarray, "h w 3"]:
+    """The ball with a background behind it, mixed in display values or in linear light."""
+    mask, straight = disc(), ball()
+    if not linear:
+        return mask * straight + (1 - mask) * np.float32(background)
+    return image_srgb(mask * srgb_decode(straight) + (1 - mask) * srgb_decode(np.full_like(straight, background)))
+
+
+@pytest.mark.parametrize("linear", [False, True])
+@pytest.mark.parametrize("background", [1.0, 0.75])
+def test_a_background_is_found_and_taken_away(background: float, linear: bool) -> None:
+    picture, mask, straight = over(background, linear), disc(), ball()
+    assert background_share(picture, mask) > MIXED
+    cleaned = without_background(picture, mask)
+    rim = (mask[..., 0] > 0.01) & (mask[..., 0] < 0.95)
+    assert np.abs(picture - straight)[rim].max() > 0.3
+    np.testing.assert_allclose(cleaned[rim], straight[rim], rtol=0, atol=0.05)
+    np.testing.assert_array_equal(cleaned[~rim], picture[~rim])
+    assert abs(background_share(cleaned, mask)) < 0.05
+
+
+@pytest.mark.parametrize("beside", [0.0, 1.0])
+def test_straight_colours_are_no_mixture(beside: float) -> None:
+    mask = disc()
+    picture = np.where(mask > 0, ball(), np.float32(beside))
+    assert abs(background_share(picture, mask)) < 0.1
+
+
+def test_nothing_is_told_without_a_rim_or_of_a_background_of_the_same_colour() -> None:
+    mask = disc()
+    assert background_share(over(1.0, False), (mask > 0.5).astype(np.float32)) == 0
+    assert background_share(np.full((SIDE, SIDE, 3), 0.5, np.float32), mask) == 0
+
+
+def test_a_soft_matte_stays_as_it_is() -> None:
+    mask = np.full((SIDE, SIDE, 1), 0.5, np.float32)
+    mask[:, :8] = 1
+    picture = over(1.0, False)
+    cleaned = without_background(picture, mask)
+    np.testing.assert_array_equal(cleaned[:, 10:], picture[:, 10:])
+    np.testing.assert_array_equal(cleaned[:, 9], picture[:, 7])
+
+
+def test_a_command_takes_the_background_out_of_the_rim_and_says_so(tmp_path: Path) -> None:
+    mask, straight = disc(), ball()
+    for name, values in {
+        "a": over(1.0, True),
+        "m": mask.repeat(3, axis=-1),
+        "s": np.where(mask > 0, straight, 0),
+    }.items():
+        Image.fromarray((255 * values + 0.5).astype(np.uint8)).save(tmp_path / f"{name}.png")
+    rim = (mask[..., 0] > 0.02) & (mask[..., 0] < 0.94)
+    picture, remarks = read_input(tmp_path / "a.png", tmp_path / "m.png")
+    assert "background is mixed into the rim" in remarks["rim"]
+    np.testing.assert_allclose(picture.image_srgb[rim], straight[rim], rtol=0, atol=0.05)
+    picture, remarks = read_input(tmp_path / "s.png", tmp_path / "m.png")
+    assert "rim" not in remarks
+    np.testing.assert_allclose(picture.image_srgb[rim], straight[rim], rtol=0, atol=0.003)
+
+
+def test_colours_beside_an_alpha_channel_are_straight(tmp_path: Path) -> None:
+    rgba = np.concatenate([over(1.0, False), disc()], axis=-1)
+    Image.fromarray((255 * rgba + 0.5).astype(np.uint8)).save(tmp_path / "a.png")
+    Image.fromarray((255 * disc()[..., 0] + 0.5).astype(np.uint8)).save(tmp_path / "m.png")
+    for given in (None, tmp_path / "m.png"):
+        picture, remarks = read_input(tmp_path / "a.png", given)
+        assert "rim" not in remarks
+        np.testing.assert_allclose(picture.image_srgb, rgba[..., :3], rtol=0, atol=0.003)
+
+
+def test_the_pipeline_tells_of_it(caplog: pytest.LogCaptureFixture) -> None:
+    pipeline = make_pipeline()
+    pipeline.decompose(np.where(disc() > 0, ball(), 0), disc(), closed=False)
+    assert "rim of the mask" not in caplog.text
+    pipeline.decompose(over(1.0, False), disc(), closed=False)
+    assert "a background is mixed into the rim of the mask" in caplog.text
