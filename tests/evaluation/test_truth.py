@@ -214,6 +214,7 @@ def test_the_generator_makes_a_suite_resumes_and_repeats_itself(tmp_path: Path) 
 
 
 MESHES_ALONE = {
+    "name": '"mine"',
     "objects": "[]",
     "ceiling_scenes": "[]",
     "bundled_lights": "2",

@@ -194,9 +194,24 @@ def test_an_object_that_fills_the_picture_is_surrounded(height: int, width: int)
     mask = np.ones((height, width, 1), np.float32)
     frame = Frame.around(mask, SIZE)
     assert frame.side == math.ceil(max(height, width) / FILL)
+    assert frame.shown == max(height, width)  # so that tiles add nothing to one of the network's size
+    assert Frame.reduced(mask, SIZE).cut is None  # what is computed of the maps needs no margin
     inside = frame.enter(mask)
     assert inside[[0, -1]].max() == inside[:, [0, -1]].max() == 0
     assert inside.sum() == pytest.approx(SIZE**2 * FILL**2 * height * width / max(height, width) ** 2, rel=0.05)
     np.testing.assert_allclose(frame.leave_map(np.ones_like(inside), mask), mask, rtol=0, atol=1e-5)
     mask[:, : math.ceil(width * (1 - LARGE))] = mask[: math.ceil(height * (1 - LARGE))] = 0
     assert Frame.around(mask, SIZE).cut is None
+
+
+def test_the_margin_grows_with_the_object() -> None:
+    """From one picture of a film to the next nothing jumps."""
+    sides = []
+    for extent in range(180, 201):
+        mask = np.zeros((200, 200, 1), np.float32)
+        mask[:, :extent] = 1
+        mask[extent:] = 0
+        sides.append(Frame.around(mask, SIZE).side)
+    assert sides[0] == 200
+    assert sides[-1] == 250
+    assert 0 <= np.diff(sides).min() <= np.diff(sides).max() <= 6

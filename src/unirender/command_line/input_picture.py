@@ -41,7 +41,7 @@ def read_input(
     """
     import numpy as np
 
-    from unirender.picture_files.mask_rim import MIXED, background_share, without_background
+    from unirender.picture_files.mask_rim import MIXED, mixture_explains, without_background
     from unirender.pictures import OPAQUE, header_pixels, read_mask_file, read_picture
 
     pixels = header_pixels(path)
@@ -53,7 +53,7 @@ def read_input(
         coverage, lost = read_mask_file(mask, (height, width))
         remarks |= lost
         opaque = picture.mask is None or picture.mask.min() >= OPAQUE  # so that its colours may have a background
-        if opaque and background_share(picture.image_srgb, coverage) > MIXED:
+        if opaque and mixture_explains(picture.image_srgb, coverage) > MIXED:
             straight = without_background(picture.image_srgb, coverage)
             picture = dataclasses.replace(picture, image_srgb=straight)
             remarks["rim"] = (

@@ -64,7 +64,7 @@ def frame_remarks(mask: "np.ndarray", side: int, tile: bool) -> dict[str, str]:
     from unirender.pipelines.tiling import tiles_of
 
     found = parts_left_out(mask, side)
-    if tile and (seen := Frame.around(mask, side).side) <= side:
+    if tile and (seen := Frame.around(mask, side).shown) <= side:
         found["tile"] = (
             f"--tile adds nothing: the part of the picture that the network looks at has {seen} pixels along a side, "
             f"no more than its own {side}"

@@ -85,7 +85,7 @@ def decompose_views(
         for view, frame, own in zip(views, frames, found, strict=True)
     ]
     for i, (view, frame) in enumerate(zip(views, frames, strict=True)):
-        if tile and frame.side > network.size:
+        if tile and frame.shown > network.size:
             samples[i] = _with_detail(network, view, frame, samples[i], how, _one(how, i).draw_seed())
     if closed:
         rendered = render_any_size(network, [sample for own in samples for sample in own], Sampling.of())

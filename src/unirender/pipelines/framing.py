@@ -23,7 +23,7 @@ from unirender.light.resampling import resample_environment
 from unirender.pipelines.masked_maps import divide, unit_normal
 
 SMALL = 2 / 3  # an object whose square has at most this share of the picture's side is cut out
-LARGE = 0.95  # an object that fills more of the longer side is surrounded: it is cut off, or nearly
+LARGE = 0.95  # share of the picture's side, from which an object gets a margin: it is then cut off, or nearly
 FILL = 0.8  # of a square that is cut out; objects of the training data fill 0.7 to 0.9 of theirs
 LEAST_CUT = 8  # pixels along the side of a square that is cut out
 FAINT = 0.05  # coverage up to which nothing counts when an object is cut out: haze of a matte
@@ -52,11 +52,12 @@ class Frame:
 
     @classmethod
     def around(cls, mask: Float[np.ndarray, "h w 1"], size: int) -> "Frame":
-        """The whole picture, or the square around its object where the object is small, or larger than the picture.
+        """The whole picture, the square around its object where that is small, or more than the picture where it is large.
 
         A network sees objects that fill most of the frame; of one that does not, most pixels would be lost on the
-        background, and objects without any background it has never seen. What is left out of the square has no surface:
-        haze of a matte, and stray pixels away from the object that hold hardly any of the coverage (`visible_parts`).
+        background, and objects without any background it has never seen: from `LARGE` on a margin grows, until an
+        object as long as the picture fills `FILL` of the square. What is left out of the square has no surface: haze of
+        a matte, and stray pixels away from the object that hold hardly any of the coverage (`visible_parts`).
 
         Args:
             mask: coverage.
@@ -69,7 +70,8 @@ class Frame:
             return whole
         extent = least_extent(visible)
         if extent > LARGE * whole.side:
-            side = math.ceil(whole.side / FILL)
+            beyond = (extent / whole.side - LARGE) / (1 - LARGE)
+            side = math.ceil(whole.side * (1 + beyond * (1 / FILL - 1)))
             return cls(height, width, size, ((height - side) // 2, (width - side) // 2, side))
         if whole.identity or extent > FILL * SMALL * whole.side:  # saves large pictures time
             return whole
@@ -83,8 +85,11 @@ class Frame:
 
     @classmethod
     def reduced(cls, mask: Float[np.ndarray, "h w 1"], most: int) -> "Frame":
-        """The same with a square of at most `most` pixels a side: what is smaller is not enlarged."""
+        """The same for what is computed of maps: without a margin, which only a network needs, and with a square of at
+        most `most` pixels a side; what is smaller is not enlarged."""
         frame = cls.around(mask, most)
+        if frame.side > max(frame.height, frame.width):
+            frame = replace(frame, cut=None)
         return replace(frame, size=min(most, frame.side))
 
     def seen(self, mask: Float[np.ndarray, "h w 1"]) -> Float[np.ndarray, "h w 1"]:
@@ -105,6 +110,11 @@ class Frame:
     def side(self) -> int:
         """Side of the square that is seen, picture pixels."""
         return max(self.height, self.width) if self.cut is None else self.cut[2]
+
+    @property
+    def shown(self) -> int:
+        """Pixels of the picture along the longer side of what is seen of it."""
+        return min(self.side, max(self.height, self.width))
 
     @property
     def corner(self) -> tuple[int, int]:

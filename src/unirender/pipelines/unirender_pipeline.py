@@ -29,7 +29,7 @@ from unirender.color import srgb_decode
 from unirender.diffusion.sampling import Generators
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.picture_files.mask_rim import MIXED, background_share
+from unirender.picture_files.mask_rim import MIXED, mixture_explains
 from unirender.pipelines.carried_light import with_carried_light
 from unirender.pipelines.decomposing import View, decompose_views
 from unirender.pipelines.dual_stream_pipeline import DualStreamPipeline
@@ -402,7 +402,7 @@ class UniRenderPipeline(DualStreamPipeline):
         picture, cover = as_picture(image, mask)
         if mask is None and cover.min() == 1:
             self._report_once("mask", "not given, and no pixel is transparent: the whole frame is taken as the object")
-        if mask is not None and background_share(picture, cover) > MIXED:
+        if mask is not None and mixture_explains(picture, cover) > MIXED:
             self._report_once(
                 "image",
                 "a background is mixed into the rim of the mask, expected straight colours as beside an alpha channel; "
