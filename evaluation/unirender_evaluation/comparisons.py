@@ -52,8 +52,8 @@ class Comparison:
     @property
     def verdict(self) -> str:
         if not self.decided:
-            few = f"on fewer than {FEWEST} objects" if self.difference.clusters < FEWEST else "under so few lights"
-            return f"is not comparable {few} with"
+            few = f"fewer than {FEWEST} objects" if self.difference.clusters < FEWEST else "so few lights"
+            return f"cannot be compared ({few}) with"
         if self.a_beats_b or self.b_beats_a:
             return "beats" if self.a_beats_b else "is beaten by"
         return "is level with" if self.equal else "is not told from"

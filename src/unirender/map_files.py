@@ -201,7 +201,7 @@ def unit_where_known(
 
 
 def one_channel(values: Float[np.ndarray, "h w c"], name: str) -> Float[np.ndarray, "h w 1"]:
-    """Grey of a picture: the mean of its channels, which are equal but for noise.
+    """Grey of a picture: the mean of its channels, which are equal but for noise where it is not black.
 
     Args:
         values: as stored.
@@ -210,7 +210,8 @@ def one_channel(values: Float[np.ndarray, "h w c"], name: str) -> Float[np.ndarr
     Raises:
         UnirenderError: it is in colour.
     """
-    if (difference := float(np.ptp(values, axis=-1).mean())) > COLOURED:
+    seen = values[(values != 0).any(axis=-1)]
+    if len(seen) and (difference := float(np.ptp(seen, axis=-1).mean())) > COLOURED:
         raise UnirenderError(
             f"{name} is in colour: its channels differ by {difference:.2g} in the mean, expected one "
             "value a pixel; write it as grey: of glTF's metallicRoughness, roughness is the green channel and metallic "

@@ -233,7 +233,7 @@ def test_run_end_to_end_and_again(
     assert "against noise-ceiling" not in first.verdict
     assert "noise-ceiling, difference" in first.verdict
     assert "ours" not in first.verdict
-    assert "is not comparable on fewer than 3 objects" in first.verdict
+    assert "cannot be compared (fewer than 3 objects)" in first.verdict
     stored = read_results(out)
     assert stored.lights == {s: own for s, own in sample_lights(tiny).items() if s in {r.sample for r in first.records}}
     with (out / "records.csv").open(newline="") as file:

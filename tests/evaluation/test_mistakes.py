@@ -298,6 +298,13 @@ def test_lights_of_8_bits_end_at_white() -> None:
         assert brightness_said(lights(others)) == ""
 
 
+@pytest.mark.parametrize(("made", "is_clipped"), [("clipped", 1.0), ("divided by its peak", 0.0)])
+def test_a_light_that_was_divided_by_its_peak_is_not_clipped(made: str, is_clipped: float) -> None:
+    true = np.exp(RNG.normal(size=(16, 32, 3)) * 2).astype(np.float32)
+    found = np.clip(true, 0, 1) if made == "clipped" else true / true.max()
+    assert list(light_facts(found, true).values()) == [is_clipped]
+
+
 def test_a_light_that_knows_nothing_has_not_been_turned() -> None:
     """Of several turns one is always nearer: each has to be nearer on most pictures by itself."""
     directions, middles = environment_directions(16, 32), RNG.normal(size=(41, 3))

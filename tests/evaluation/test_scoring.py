@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -193,6 +194,12 @@ def test_maps_that_no_picture_tells_are_noted() -> None:
     few = records(math.inf, 0.1, albedo=-20.0)[:3]
     assert truth_said(records(40.0, 1.0, albedo=-9.0, normal=-9.0)) == truth_said(few) == ""
     assert truth_said(records(math.inf, 0.1)) == "", "no stranger's"
+    told = records(40.0, 1.0, roughness=-9.0)
+    for right, said in ((3, ""), (4, "metallic (4 of 4 pictures)")):  # a constant is right on some pictures
+        errors = [{metric_key("metallic", "mse"): float(i >= right)} for i in range(4)]
+        made = [replace(r, values=r.values | error) for r, error in zip(told, errors, strict=True)]
+        assert said in truth_said(made)
+        assert bool(said) == bool(truth_said(made))
 
 
 def test_pictures_and_lights_have_gains_and_nothing_has_none_of_its_own() -> None:

@@ -361,7 +361,7 @@ def test_one_object_decides_nothing() -> None:
     assert not found[0].holds
     text = str(found[0])
     assert (
-        "open   inverse/single-image albedo PSNR: a is not comparable on fewer than 3 objects with b, difference"
+        "open   inverse/single-image albedo PSNR: a cannot be compared (fewer than 3 objects) with b, difference"
         in text
     )
     assert text.endswith("1 object)")

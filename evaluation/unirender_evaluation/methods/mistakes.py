@@ -72,7 +72,7 @@ GAINS: Mapping[str, Metric] = {
     for name, mistake in MISTAKES.items()
 }
 
-# Signed: no file of results may have a value below `perfect`.
+# A signed value, for which -1 stands as `perfect`: no file of results may have one below that.
 BIAS = Metric("bias", "bias", "", LOWER, -1.0, (), 4, "masked mean of p - t, of a stranger's answer")
 AT_WHITE = Metric(
     "at_white",
@@ -172,9 +172,15 @@ def light_gains(found: Light, true: Float[np.ndarray, "h2 w2 3"]) -> dict[str, f
 
 
 def light_facts(found: Light, true: Float[np.ndarray, "h2 w2 3"]) -> dict[str, float]:
-    """Whether a light ends at white, where the true one is bright; arguments as in `light_gains`."""
-    at_white = float(WHITE[0] <= found.max() <= WHITE[1])
-    return {metric_key("environment", AT_WHITE): at_white} if true.max() > BRIGHT else {}
+    """Whether a light ends at white, where the true one is bright; arguments as in `light_gains`.
+
+    Of a light that was clipped as much is at white as the true one has above it; of one that was divided by its
+    brightest texel hardly more than that.
+    """
+    if true.max() <= BRIGHT:
+        return {}
+    clipped = found.max() <= WHITE[1] and (found >= WHITE[0]).mean() >= (true > BRIGHT).mean()
+    return {metric_key("environment", AT_WHITE): float(clipped)}
 
 
 def roughness_facts(found: Intrinsics, true: Intrinsics, mask: Mask) -> dict[str, float]:

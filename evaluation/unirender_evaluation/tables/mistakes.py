@@ -20,10 +20,12 @@ QUANTITIES = {
     "edit_roughness": "edits of roughness",
     "relit": "relit",
 }
-TRUE: tuple[tuple[str, str, Callable[[float], bool]], ...] = (  # of maps, which have no noise ceiling
-    ("albedo", metric_key("albedo", "psnr"), lambda db: db > 50),
-    ("normal", metric_key("normal", "angle_deg"), lambda degrees: degrees < 0.5),
-)
+TRUE: tuple[tuple[str, str, Callable[[float], bool], float], ...] = (  # of maps, which have no noise ceiling
+    ("albedo", metric_key("albedo", "psnr"), lambda db: db > 50, 0.0),
+    ("normal", metric_key("normal", "angle_deg"), lambda degrees: degrees < 0.5, 0.0),
+    ("roughness", metric_key("roughness", "mse"), lambda mse: mse < 1e-5, 0.75),
+    ("metallic", metric_key("metallic", "mse"), lambda mse: mse < 1e-5, 0.75),
+)  # quantity, metric, whether it is the truth, and in which share of pictures more: a constant is right on some
 MOST = 0.75  # of the pictures that say anything
 LEAST_DB = 0.1  # smaller gains say nothing, as those of a constant or of an object of one colour
 OF_ROUGHNESS = {metric_key("roughness", GAINS[name]) for name in ("if_decoded", "if_inverted", "if_root")}
@@ -50,11 +52,13 @@ def mistakes_said(records: Sequence[Record]) -> str:
 def truth_said(records: Sequence[Record]) -> str:
     """The sentence on maps that no picture tells so well; empty where they are too few to be noted."""
     found = []
-    for name, key, is_true in TRUE:
-        of_stranger = metric_key(name, GAINS["if_shifted"])  # Mitsuba's own maps have no gains
-        asked = [record for record in records if key in record.values and of_stranger in record.values]
+    strangers = [
+        record for record in records if any(".if_" in key for key in record.values)
+    ]  # Mitsuba's maps have none
+    for name, key, is_true, least in TRUE:
+        asked = [record for record in strangers if key in record.values]
         true = [record.object for record in asked if is_true(record.values[key])]
-        if len(set(true)) >= FEWEST:
+        if len(set(true)) >= FEWEST and len(true) > least * len(asked):
             found.append(f"{name} ({len(true)} of {len(asked)} pictures)")
     return f"its answers are the truth but for rounding: {', '.join(found)} (was it told?)" if found else ""
 

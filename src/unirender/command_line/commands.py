@@ -4,7 +4,7 @@ They know nothing of the ground truth: what reads the light files is passed in b
 """
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -128,7 +128,7 @@ class Render:
         from unirender.new_folders import new_folder
         from unirender.pipelines.edited_light import with_edited_light
         from unirender.pipelines.editing import under_light
-        from unirender.pipelines.rendered_maps import RENDER_NEEDS, ready_to_render, to_derive, told_derived, with_mask
+        from unirender.pipelines.rendered_maps import ready_to_render, to_derive, told_derived, with_mask
 
         self.model.check()
         check_stops(self.exposure)
@@ -139,7 +139,7 @@ class Render:
         intrinsics = with_edits(stored, self.maps)
         if self.environment is None:
             intrinsics = with_edited_light(stored, intrinsics)
-        intrinsics.require(*RENDER_NEEDS)
+        self._check_maps(intrinsics.present)
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light = None if self.environment is None else exposed_light(read_light, self.environment, self.exposure)
             pipeline = self.model.load()
@@ -154,16 +154,33 @@ class Render:
             of_light = to_derive(intrinsics) if self.environment is None else ("specular", "diffuse")
             if of_light:
                 meta["shadows"] = self.shadows  # of what is derived; of maps that are given nobody is asked
+            if of_light and self.environment is None:
+                of_folder = intrinsics.environment, "keep", intrinsics.specular, intrinsics.diffuse
+                intrinsics = under_light(intrinsics, *of_folder, shadows=self.shadows)
             meta["remarks"] = remarks | parts_left_out(intrinsics.mask, self.model.side(pipeline))
             for remark in meta["remarks"].values():
                 notice(remark)
-            added = () if self.environment is None else of_light  # they are there, as direct light
-            ready = ready_to_render(intrinsics, self.shadows, added)  # here, so that it is done once
+            # What is derived is direct light. Here, so that it is done once.
+            ready = ready_to_render(intrinsics, self.shadows, of_light)
             image = pipeline.render(ready, derived=told_derived(of_light, self.shadows), **self.model.sampling())
             meta |= {**self.model.provenance(pipeline), **overflow(pipeline, ready), **at_white(image, ready.mask)}
             write_result(folder, intrinsics, meta, image)
         print(f"{self.out.output}")
         return 0
+
+    def _check_maps(self, present: Collection[str]) -> None:
+        """Looks at which maps there are.
+
+        Raises:
+            UnirenderError: one that every rendering needs is missing.
+        """
+        from unirender.pipelines.rendered_maps import RENDER_NEEDS
+
+        if missing := [name for name in RENDER_NEEDS if name not in present]:
+            files = f"; add a file like {missing[0]}.png" if self.maps.is_dir() else ""
+            raise UnirenderError(
+                f"{self.maps}: {', '.join(missing)} missing, expected at least {', '.join(RENDER_NEEDS)}{files}"
+            )
 
     def _memory_remarks(self) -> dict[str, str]:
         """As `memory_remarks` has them, of the maps' size in their header."""

@@ -114,13 +114,13 @@ def missing_maps(intrinsics: "Intrinsics", new_light: bool) -> dict[str, Any]:
     facts: dict[str, Any] = {"imagined": imagined, "derived": list(derived)}
     said = [f"the network imagines {', '.join(imagined)}"] if imagined else []
     if derived and not new_light:
-        said.append(f"{', '.join(derived)} {'follow' if len(derived) > 1 else 'follows'} from the environment")
+        said.append(f"{' and '.join(derived)} {'follow' if len(derived) > 1 else 'follows'} from the environment")
     if intrinsics.mask is None:
         whole = bool(with_mask(intrinsics).require("mask")["mask"].all())
         facts["mask_from"] = "frame" if whole else "normal"
         said.append("the mask is the whole frame" if whole else "the mask is where the normal is not 0")
     if said:
-        notice(f"maps that are missing: {'; '.join(said)}")
+        notice(f"in place of maps that are missing: {'; '.join(said)}")
     return facts
 
 

@@ -4,8 +4,8 @@ There the picture shows a mixture, S = m F + (1 - m) B, of display values or in 
 alone, as an RGBA picture has it: a bright background passes for a rim of reflected light. A background that is darker
 than the object does little harm, and an object that darkens towards its outline looks the same: it is left alone.
 
-Notation: m the coverage, S the picture, F the object's colour, B the background's. F and B are looked for in the nearest
-pixels that are wholly covered and not at all.
+Notation: m the coverage, S the picture, F the object's colour, B the background's. F and B are looked for in the
+nearest pixels that are wholly covered and not at all.
 """
 
 import numpy as np
@@ -34,8 +34,8 @@ def mixture_explains(image_srgb: Float[np.ndarray, "h w 3"], mask: Float[np.ndar
         mask: coverage.
 
     Returns:
-        Near 1 of a picture with a background brighter than the object, mostly below 0 of straight colours. 0 where there
-        is no rim, where it is no outline, or where most of the background is no brighter.
+        Near 1 of a picture with a background brighter than the object, mostly below 0 of straight colours. 0 where
+        there is no rim, where it is no outline, or where most of the background is no brighter.
     """
     rim = _rim(mask)
     if len(rim[0]) > WIDEST * mask.size:

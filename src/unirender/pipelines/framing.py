@@ -52,7 +52,7 @@ class Frame:
 
     @classmethod
     def around(cls, mask: Float[np.ndarray, "h w 1"], size: int) -> "Frame":
-        """The whole picture, the square around its object where that is small, or more than the picture where it is large.
+        """The whole picture, the square around its object where that is small, or more than it where that is large.
 
         A network sees objects that fill most of the frame; of one that does not, most pixels would be lost on the
         background, and objects without any background it has never seen: from `LARGE` on a margin grows, until an
