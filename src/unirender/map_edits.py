@@ -14,7 +14,7 @@ from unirender.errors import UnirenderError
 from unirender.exr import CAMERA_ATTRIBUTE, LIGHT_ATTRIBUTE, states
 from unirender.intrinsics import RADIANCE_MAPS, Intrinsics
 from unirender.map_files import MapFile, check_size, map_files, read_map_file, report_unread
-from unirender.pictures import read_mask
+from unirender.pictures import mask_values, read_mask
 
 INTRINSICS = "intrinsics.exr"
 
@@ -42,9 +42,10 @@ def with_edits(stored: Intrinsics, folder: Path) -> Intrinsics:
     said: list[str] = []
     mask = np.ones((*size, 1), np.float32) if stored.mask is None else stored.mask
     if "mask" in files:
-        painted = read_mask(path := files.pop("mask"), size)
-        if (changed := MapFile(painted, painted).differs("mask", mask)).any():
-            changes["mask"] = mask = painted
+        shown = mask_values(path := files.pop("mask"))
+        check_size(path, shown, size, INTRINSICS)
+        if (changed := MapFile(shown, shown).differs("mask", mask)).any():
+            changes["mask"] = mask = read_mask(path, size)
             said.append(f"{path.name} ({100 * changed.mean():.3g}% of the frame)")
     inside = mask[..., 0] > 0
     for name, path in files.items():

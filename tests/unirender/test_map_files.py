@@ -166,6 +166,21 @@ def test_a_light_whose_file_was_edited_is_on_the_grid_it_was_on(folder: Path, ca
         read_result(folder)
 
 
+def test_what_is_hardly_there_was_not_edited(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A mask below one half everywhere, and normals that a picture shows as none."""
+    maps = lit_ball()
+    mask, roughness = maps.require("mask", "roughness").values()
+    faint = Intrinsics(mask=0.4 * mask, roughness=roughness, normal=np.full((SIZE, SIZE, 3), 1e-9, np.float32))
+    write_result(tmp_path, faint, {})
+    stored = read_result(tmp_path, edits=False)
+    for name, value in read_result(tmp_path).maps.items():
+        np.testing.assert_array_equal(value, stored.maps[name], err_msg=name)
+    assert "edited" not in caplog.text
+    paint(tmp_path / "mask.png", 0)
+    with pytest.raises(UnirenderError, match=r"mask.png: the mask is empty"):
+        read_result(tmp_path)
+
+
 def test_maps_of_other_programs_in_exr(tmp_path: Path) -> None:
     """Linear values; normals in [-1, 1]; premultiplied where there is alpha, and one channel of any name for grey."""
     maps = lit_ball()
