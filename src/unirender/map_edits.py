@@ -6,13 +6,14 @@ write may be anything, and are not looked at.
 """
 
 import logging
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 
 from unirender.errors import UnirenderError
 from unirender.exr import CAMERA_ATTRIBUTE, LIGHT_ATTRIBUTE, states
-from unirender.intrinsics import RADIANCE_MAPS, Intrinsics
+from unirender.intrinsics import IMAGE_MAPS, RADIANCE_MAPS, Intrinsics
 from unirender.map_files import MapFile, check_size, map_files, read_map_file, report_unread
 from unirender.pictures import mask_values, read_mask
 
@@ -21,7 +22,7 @@ INTRINSICS = "intrinsics.exr"
 logger = logging.getLogger(__name__)
 
 
-def with_edits(stored: Intrinsics, folder: Path) -> Intrinsics:
+def with_edits(stored: Intrinsics, folder: Path, names: Collection[str] = IMAGE_MAPS) -> Intrinsics:
     """The maps as the pictures beside `intrinsics.exr` show them; how much was edited is logged.
 
     s and d of a light that was edited are forgotten: they follow from it. Those of an edited normal or roughness are
@@ -30,6 +31,7 @@ def with_edits(stored: Intrinsics, folder: Path) -> Intrinsics:
     Args:
         stored: what `intrinsics.exr` and `environment.exr` hold.
         folder: where they are.
+        names: the image-aligned maps whose pictures count; the others' are not looked at.
 
     Raises:
         UnirenderError: a picture is broken, of another size, or no such map.
@@ -37,7 +39,8 @@ def with_edits(stored: Intrinsics, folder: Path) -> Intrinsics:
     if not states(folder / INTRINSICS, CAMERA_ATTRIBUTE):
         return stored
     report_unread(folder)
-    files, size = map_files(folder), (stored.height, stored.width)
+    files = {name: path for name, path in map_files(folder).items() if name in names}
+    size = (stored.height, stored.width)
     changes: dict[str, np.ndarray | None] = {}
     said: list[str] = []
     mask = np.ones((*size, 1), np.float32) if stored.mask is None else stored.mask
