@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from unirender.errors import UnirenderError
-from unirender.exr import CAMERA_ATTRIBUTE, LIGHT_ATTRIBUTE, states
+from unirender.exr import CAMERA_ATTRIBUTE, LIGHT_ATTRIBUTE, light_sha256, stated
 from unirender.intrinsics import IMAGE_MAPS, RADIANCE_MAPS, Intrinsics
 from unirender.map_files import MapFile, check_size, map_files, read_map_file, report_unread
 from unirender.pictures import mask_values, read_mask
@@ -36,13 +36,21 @@ def with_edits(stored: Intrinsics, folder: Path, names: Collection[str] = IMAGE_
     Raises:
         UnirenderError: a picture is broken, of another size, or no such map.
     """
-    if not states(folder / INTRINSICS, CAMERA_ATTRIBUTE):
+    if stated(folder / INTRINSICS, CAMERA_ATTRIBUTE) is None:
         return stored
     report_unread(folder)
     files = {name: path for name, path in map_files(folder).items() if name in names}
     size = (stored.height, stored.width)
-    changes: dict[str, np.ndarray | None] = {}
+    changes: dict[str, np.ndarray] = {}
     said: list[str] = []
+    if (light := _painted_light(stored, folder)) is not None:
+        stored = stored.replace(specular=None, diffuse=None, environment=light)
+        said.append("environment.png: specular and diffuse follow from it")
+    if stored.environment is not None:
+        of_light = [name for name in files if name in RADIANCE_MAPS and getattr(stored, name) is None]
+        if of_light:
+            unread = ", ".join(files.pop(name).name for name in of_light)
+            logger.warning("%s: not looked at: %s, since the light says what they show", folder, unread)
     mask = np.ones((*size, 1), np.float32) if stored.mask is None else stored.mask
     if "mask" in files:
         shown = mask_values(path := files.pop("mask"))
@@ -53,17 +61,12 @@ def with_edits(stored: Intrinsics, folder: Path, names: Collection[str] = IMAGE_
     inside = mask[..., 0] > 0
     for name, path in files.items():
         known = getattr(stored, name)
-        if known is None and name in RADIANCE_MAPS and stored.environment is not None:
-            continue  # it follows from the light
         found = read_map_file(path, name)
         check_size(path, found.value, size, INTRINSICS)
         changed = inside if known is None else inside & found.differs(name, known)
         if changed.any():
             changes[name] = np.where(changed[..., None], found.value, 0 if known is None else known)
             said.append(f"{path.name} ({100 * changed.sum() / inside.sum():.3g}% of the object)")
-    if (light := _painted_light(stored, folder)) is not None:
-        changes |= {"specular": None, "diffuse": None, "environment": light}
-        said.append("environment.png: specular and diffuse follow from it")
     if said:
         logger.warning("edited in %s: %s", folder, ", ".join(said))
     try:
@@ -73,11 +76,10 @@ def with_edits(stored: Intrinsics, folder: Path, names: Collection[str] = IMAGE_
 
 
 def _painted_light(stored: Intrinsics, folder: Path) -> np.ndarray | None:
-    """The light where its picture was edited; None where it was not, or where the picture may be of another light: s
-    and d that state theirs tell."""
+    """The light where its picture was edited; None where it was not, or where the light is another one than was written
+    with the maps, and the picture that of the old one."""
     picture, light = folder / "environment.png", stored.environment
-    lit = stored.specular is not None or stored.diffuse is not None
-    if light is None or not lit or not states(folder / INTRINSICS, LIGHT_ATTRIBUTE) or not picture.is_file():
+    if light is None or not picture.is_file() or stated(folder / INTRINSICS, LIGHT_ATTRIBUTE) != light_sha256(light):
         return None
     found = read_map_file(picture, "environment")
     check_size(picture, found.value, light.shape[:2], "environment.exr")
