@@ -31,6 +31,7 @@ VOCABULARY = {
         "light.resampling",
         "light.surface_light",
         "light.symmetries",
+        "map_edits",
         "picture_files.cicp",
         "picture_files.display_files",
         "picture_files.icc",

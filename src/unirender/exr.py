@@ -7,6 +7,7 @@ environment is a file of its own in float32, since the sun overflows half, and s
 gives equal bytes.
 """
 
+import hashlib
 import io
 import re
 from collections.abc import Mapping
@@ -31,7 +32,7 @@ HALF_MAX = 65504.0
 HALF_FULL = 2.0**-10  # half precision has all its digits down to 2^-14: of radiance that ends below, too few are left
 ATTRIBUTE_PREFIX = "unirender:"
 CAMERA_ATTRIBUTE = "camera"  # as `unirender.camera.Camera.describe` has it
-LIGHT_ATTRIBUTE = "light_sha256"  # of maps: of the environment beside them, to which their s and d belong
+LIGHT_ATTRIBUTE = "light_sha256"  # of maps: of the environment beside them, to which s and d belong (`light_sha256`)
 GRID_ATTRIBUTE, POLE_GRID = "grid", "poles"
 GAUGE_ATTRIBUTE = "exposure_factor"  # of ground truth: its environments are on the pole grid, too
 _COMPONENTS = {"normal": "XYZ", "albedo": "RGB", "specular": "RGB", "diffuse": "RGB"}  # the others: "Y"
@@ -171,12 +172,19 @@ def channel_names(path: Path) -> frozenset[str]:
         return frozenset()
 
 
-def states(path: Path, attribute: str) -> bool:
-    """Whether the header of a file has an attribute of ours; not where there is none that can be read."""
+def stated(path: Path, attribute: str) -> str | None:
+    """An attribute of ours in the header of a file; None where there is none that can be read."""
+    if not path.is_file():
+        return None
     try:
-        return path.is_file() and ATTRIBUTE_PREFIX + attribute in OpenEXR.File(str(path), header_only=True).header()
+        return OpenEXR.File(str(path), header_only=True).header().get(ATTRIBUTE_PREFIX + attribute)
     except Exception:  # several types, as in reading
-        return False
+        return None
+
+
+def light_sha256(environment: Float[np.ndarray, "eh ew 3"]) -> str:
+    """What tells one light from another."""
+    return hashlib.sha256(repr(environment.shape).encode() + environment.tobytes()).hexdigest()
 
 
 def read_exr_bytes(data: bytes, name: str = "EXR data") -> tuple[Channels, dict[str, str]]:

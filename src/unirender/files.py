@@ -7,7 +7,6 @@ EXR says in its header attributes `unirender:*` where it comes from and through 
 """
 
 import dataclasses
-import hashlib
 import json
 import logging
 from collections.abc import Mapping
@@ -29,6 +28,7 @@ from unirender.exr import (
     image_channels,
     intrinsics_channels,
     intrinsics_from_channels,
+    light_sha256,
     on_pole_grid,
     radiance_fits_half,
     read_exr,
@@ -77,8 +77,8 @@ def write_result(
     if intrinsics is not None:
         if any(name in IMAGE_MAPS for name in intrinsics.present):
             of_maps = attributes
-            if intrinsics.environment is not None and _is_lit(intrinsics):
-                of_maps = attributes | {LIGHT_ATTRIBUTE: _light_sha256(intrinsics.environment)}
+            if intrinsics.environment is not None:
+                of_maps = attributes | {LIGHT_ATTRIBUTE: light_sha256(intrinsics.environment)}
             channels = intrinsics_channels(intrinsics)
             half = radiance_fits_half(channels)
             write_exr(folder / INTRINSICS_FILE, channels, half=half, attributes=of_maps)
@@ -215,22 +215,13 @@ def _camera_of_header(path: Path, attributes: Mapping[str, str]) -> Camera:
         raise UnirenderError(f"{path}: {error}; pass the field of view (fov_deg, --fov)") from error
 
 
-def _is_lit(intrinsics: Intrinsics) -> bool:
-    """Whether there is s or d."""
-    return intrinsics.specular is not None or intrinsics.diffuse is not None
-
-
-def _light_sha256(environment: Float[np.ndarray, "eh ew 3"]) -> str:
-    return hashlib.sha256(repr(environment.shape).encode() + environment.tobytes()).hexdigest()
-
-
 def _with_light(maps: Intrinsics, folder: Path, sha256: str | None) -> Intrinsics:
     """The maps with the environment of their folder; without s and d where it was edited since they were written.
 
     Args:
         maps: of the folder.
         folder: with an environment.
-        sha256: of the environment that s and d belong to, where the maps state it.
+        sha256: of the environment that was written with them, where they state it.
 
     Raises:
         UnirenderError: it is broken, a map from elsewhere, whose rows lie otherwise, or one of ours that s and d do not
@@ -244,23 +235,25 @@ def _with_light(maps: Intrinsics, folder: Path, sha256: str | None) -> Intrinsic
     except UnirenderError as error:
         raise UnirenderError(f"{file}: {error}") from error
     ours = on_pole_grid(attributes)
-    if not ours and not _is_size_of(folder / f"{file.stem}.png", environment):
+    if not ours and not (sha256 and _is_size_of(folder / f"{file.stem}.png", environment)):
         raise UnirenderError(
             f"{file}: is no environment that unirender wrote, and a lat-long map from elsewhere has to be resampled; "
             "take it out of the folder and pass it as --environment (with --exposure 0 as bright as it is), in Python "
             "load_light(path, normalise=False).environment of unirender_reference.lights"
         )
-    if not _is_lit(maps) or not sha256 or sha256 == _light_sha256(environment):
+    if not sha256 or sha256 == light_sha256(environment):
         return lit
-    if ours:
+    if not ours:
+        logger.warning("%s: edited, so that specular and diffuse follow from it", file)
+        return lit.replace(specular=None, diffuse=None)
+    if maps.specular is not None or maps.diffuse is not None:
         raise UnirenderError(
             f"{folder}: {ENVIRONMENT_FILE} is another light than that of the specular and diffuse beside it, which are "
             "rendered as they are; put it back, and pass the other light as --environment (with --exposure 0 as bright "
             "as it is), in Python read_result(path, light=False).replace(environment=other, specular=None, "
             "diffuse=None): they are then derived from it"
         )
-    logger.warning("%s: edited, so that specular and diffuse follow from it", file)
-    return lit.replace(specular=None, diffuse=None)
+    return lit
 
 
 def _is_size_of(picture: Path, environment: Float[np.ndarray, "eh ew 3"]) -> bool:

@@ -52,14 +52,16 @@ class MapFile:
     alpha: Float[np.ndarray, "h w 1"] | None = None
 
     def differs(self, name: str, stored: Float[np.ndarray, "h w c"]) -> Bool[np.ndarray, "h w"]:
-        """Where it is opaque and shows another value than a map does by more than 8 bits round."""
-        changed = by_rows(partial(_differs, name), self.shown, stored)
+        """Where it is opaque, another value than that of a map, and shown as another by more than 8 bits round."""
+        changed = by_rows(partial(_differs, name), self.shown, self.value, stored)
         return changed if self.alpha is None else changed & (self.alpha[..., 0] > 0.5)
 
 
-def _differs(name: str, shown: Float[np.ndarray, "h w c"], stored: Float[np.ndarray, "h w c"]) -> np.ndarray:
+def _differs(
+    name: str, shown: Float[np.ndarray, "h w c"], value: Float[np.ndarray, "h w c"], stored: Float[np.ndarray, "h w c"]
+) -> np.ndarray:
     levels, others = (eight_bits(picture).astype(np.int16) for picture in (shown, map_picture(name, stored)))
-    return np.abs(levels - others).max(axis=-1) > SAME_LEVELS
+    return (np.abs(levels - others).max(axis=-1) > SAME_LEVELS) & (value != stored).any(axis=-1)
 
 
 def map_files(folder: Path) -> dict[str, Path]:

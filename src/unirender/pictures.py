@@ -127,7 +127,7 @@ def read_mask_file(
     """
     path = checked_file(path)
     exr = path.suffix.lower() == ".exr"
-    mask = _read_exr_mask(path) if exr else coverage(stored_values(path, upright=upright))
+    mask = mask_values(path, upright=upright)
     if mask.shape[:2] != size:
         on_its_side = upright and mask.shape[1::-1] == size
         advice = " as its EXIF orientation turns it; turn the mask likewise" if on_its_side else ""
@@ -147,6 +147,15 @@ def read_mask_file(
     if low < -ALPHA_TOLERANCE or high > 1 + ALPHA_TOLERANCE:
         remarks["mask_range"] = f"the mask has values in [{low:.3g}, {high:.3g}], clipped to [0, 1]"
     return check_mask(mask, str(path)), remarks
+
+
+def mask_values(path: Path, *, upright: bool = True) -> Float[np.ndarray, "h w 1"]:
+    """Coverage as a file has it, empty or beyond [0, 1] as it may be.
+
+    Raises:
+        UnirenderError: the file is broken.
+    """
+    return _read_exr_mask(path) if path.suffix.lower() == ".exr" else coverage(stored_values(path, upright=upright))
 
 
 def check_mask(mask: Float[np.ndarray, "h w 1"], name: str) -> Float[np.ndarray, "h w 1"]:

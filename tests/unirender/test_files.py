@@ -429,7 +429,8 @@ def test_a_light_that_was_exchanged_is_noticed(tmp_path: Path) -> None:
             write_result(folder, maps, {})
         np.testing.assert_array_equal(read_result(tmp_path / name).environment, light)
         shutil.copy(other, tmp_path / name / "environment.exr")
-    assert read_result(tmp_path / "surface").environment is not None  # nothing there comes from a light
+    # nothing there comes from a light; its picture is that of the old one, and no edit
+    np.testing.assert_array_equal(read_result(tmp_path / "surface").environment, 2 * light)
     assert read_result(tmp_path / "lit", light=False).diffuse is not None
     with pytest.raises(
         UnirenderError, match=r"environment.exr is another light than .* pass the other light as --envi"

@@ -137,17 +137,29 @@ def test_where_an_edit_is_transparent_the_map_stays(folder: Path) -> None:
     np.testing.assert_array_equal(found[: MIDDLE.start], stored[: MIDDLE.start])
 
 
-def test_a_light_that_was_painted_takes_its_s_and_d_along(folder: Path) -> None:
-    stored = read_result(folder).require("environment")["environment"]
+def paint_light(folder: Path) -> None:
+    """Switches a quarter of it off."""
     image = opened(folder / "environment.png")
     image.paste((0, 0, 0), (0, 0, 4, 8))
     image.save(folder / "environment.png")
+
+
+@pytest.mark.parametrize("lit", [True, False])
+def test_a_light_that_was_painted_takes_its_s_and_d_along(
+    lit: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder, maps = tmp_path, lit_ball()
+    write_result(folder, maps if lit else maps.replace(specular=None, diffuse=None), {})
+    stored = read_result(folder).require("environment")["environment"]
+    assert not caplog.text
+    paint_light(folder)
     found = read_result(folder)
+    assert "environment.png: specular and diffuse follow from it" in caplog.text
     light = found.require("environment")["environment"]
     assert not light[:, :4].any()
     np.testing.assert_array_equal(light[:, 4:], stored[:, 4:])
     assert not {"specular", "diffuse"} & set(found.present)
-    assert read_result(folder, light=False).specular is not None
+    assert (read_result(folder, light=False).specular is not None) == lit
 
 
 def test_a_light_whose_file_was_edited_is_on_the_grid_it_was_on(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -160,10 +172,48 @@ def test_a_light_whose_file_was_edited_is_on_the_grid_it_was_on(folder: Path, ca
     np.testing.assert_array_equal(found.require("environment")["environment"], brighter)
     assert not {"specular", "diffuse"} & set(found.present)
     assert "environment.exr: edited, so that specular and diffuse follow from it" in caplog.text
+    (folder / "intrinsics.exr").unlink()  # of ours, which alone say whose picture is beside it
+    with pytest.raises(UnirenderError, match="is no environment that unirender wrote"):
+        read_result(folder)
+    caplog.clear()
+    write_result(folder, lit_ball().replace(specular=None, diffuse=None), {})
+    write_exr(folder / "environment.exr", image_channels(brighter), half=False)
+    np.testing.assert_array_equal(read_result(folder).require("environment")["environment"], brighter)
+    assert "environment.exr: edited" in caplog.text
     larger = np.ones((16, 32, 3), np.float32)
     write_exr(folder / "environment.exr", image_channels(larger), half=False)
     with pytest.raises(UnirenderError, match="is no environment that unirender wrote"):
         read_result(folder)
+
+
+@pytest.mark.parametrize("file", ["environment.png", "environment.exr"])
+def test_s_that_was_painted_beside_another_light_is_told(
+    file: str, folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    paint(folder / "specular.png", (0, 0, 255))
+    if file == "environment.png":
+        paint_light(folder)
+    else:
+        light = lit_ball().require("environment")["environment"]
+        write_exr(folder / file, image_channels(2 * light), half=False)
+    assert read_result(folder).specular is None
+    assert "not looked at: diffuse.png, specular.png, since the light" in caplog.text
+    assert "specular.png (" not in caplog.text
+
+
+def test_what_is_hardly_there_was_not_edited(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A mask below one half everywhere, and normals that a picture shows as none."""
+    maps = lit_ball()
+    mask, roughness = maps.require("mask", "roughness").values()
+    faint = Intrinsics(mask=0.4 * mask, roughness=roughness, normal=np.full((SIZE, SIZE, 3), 1e-9, np.float32))
+    write_result(tmp_path, faint, {})
+    stored = read_result(tmp_path, edits=False)
+    for name, value in read_result(tmp_path).maps.items():
+        np.testing.assert_array_equal(value, stored.maps[name], err_msg=name)
+    assert "edited" not in caplog.text
+    paint(tmp_path / "mask.png", 0)
+    with pytest.raises(UnirenderError, match=r"mask.png: the mask is empty"):
+        read_result(tmp_path)
 
 
 def test_maps_of_other_programs_in_exr(tmp_path: Path) -> None:

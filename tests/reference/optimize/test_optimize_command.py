@@ -382,6 +382,16 @@ def test_the_camera_is_that_of_the_header_or_of_the_normals(tmp_path: Path, capl
         read_picture_input(tmp_path / "one.exr", normal=tmp_path / "gone")
 
 
+def test_of_a_result_folder_the_normals_picture_counts_and_no_other_maps(tmp_path: Path):
+    normal, mask = np.zeros((12, 16, 3), np.float32), np.ones((12, 16, 1), np.float32)
+    normal[..., 2] = 1
+    write_result(tmp_path, Intrinsics(normal=normal, albedo=normal, mask=mask, camera=Camera()), {})
+    write_png(tmp_path / "albedo.png", normal[::2, ::2])  # of another size
+    np.testing.assert_array_equal(read_normals(tmp_path), normal)
+    write_png(tmp_path / "normal.png", normal[..., ::-1] / 2 + 0.5)
+    np.testing.assert_allclose(read_normals(tmp_path), normal[..., ::-1], rtol=0, atol=0.01)
+
+
 def test_normals_of_the_pictures_own_size_are_reduced_with_it(tmp_path: Path):
     """They are the mean directions; those of the reduced size are taken as they are."""
     rng = np.random.default_rng(1)

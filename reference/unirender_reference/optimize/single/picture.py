@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from unirender.camera import DEFAULT_FOV_DEG, Camera
 from unirender.errors import UnirenderError
 from unirender.files import read_result
+from unirender.map_edits import with_edits
 from unirender.picture_files.display_files import stored_values
 from unirender.pictures import checked_file, read_mask
 from unirender_reference.optimize.files.folder import read_picture_file
@@ -189,7 +190,8 @@ def read_normals(path: Path) -> Float[np.ndarray, "h w 3"]:
         UnirenderError: the file is unreadable or has no normals.
     """
     if _has_maps(path):
-        normal = read_result(path, fov_deg=DEFAULT_FOV_DEG, light=False).normal
+        stored = read_result(path, fov_deg=DEFAULT_FOV_DEG, light=False, edits=False)
+        normal = with_edits(stored, path, ("normal", "mask")).normal
         if normal is None:
             raise UnirenderError(
                 f"{path}: has no normals, expected the channels normal.X, normal.Y, normal.Z; "
