@@ -235,7 +235,7 @@ def test_render_of_a_folder_without_maps_is_one_line(tmp_path: Path, capfd: pyte
     """What OpenEXR prints of a missing file by itself counts, too."""
     assert run("render", tmp_path, "--output", tmp_path / "out") == 1
     (line,) = capfd.readouterr().err.splitlines()
-    assert "has no intrinsics.exr and no maps like albedo.png, expected the output folder of" in line
+    assert "has no intrinsics.exr and no maps like albedo.png, expected the output of" in line
 
 
 def test_render_says_where_normals_face_away(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

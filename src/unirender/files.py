@@ -175,8 +175,8 @@ def _single_maps(folder: Path) -> Intrinsics:
         inside = sorted(found.parent.name for found in folder.glob(f"*/{INTRINSICS_FILE}"))
         several = f": name one of the folders inside, like {folder / inside[0]}" if inside else ""
         raise UnirenderError(
-            f"{folder}: has no {INTRINSICS_FILE} and no maps like albedo.png, expected the output folder of "
-            f"`unirender decompose`{several}"
+            f"{folder}: has no {INTRINSICS_FILE} and no maps like albedo.png, expected the output of "
+            f"`unirender decompose` or a folder with a file for each map{several}"
         )
     report_unread(folder)
     if (picture := folder / "environment.png").is_file() and not (folder / ENVIRONMENT_FILE).is_file():
