@@ -197,7 +197,7 @@ def test_maps_that_no_picture_tells_are_noted() -> None:
     told = records(40.0, 1.0, roughness=-9.0)
     for right, said in ((3, ""), (4, "metallic (4 of 4 pictures)")):  # a constant is right on some pictures
         errors = [{metric_key("metallic", "mse"): float(i >= right)} for i in range(4)]
-        made = [replace(r, values=r.values | error) for r, error in zip(told, errors, strict=True)]
+        made = [replace(r, values={**r.values, **error}) for r, error in zip(told, errors, strict=True)]
         assert said in truth_said(made)
         assert bool(said) == bool(truth_said(made))
 

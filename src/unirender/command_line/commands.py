@@ -155,8 +155,9 @@ class Render:
             if of_light:
                 meta["shadows"] = self.shadows  # of what is derived; of maps that are given nobody is asked
             if of_light and self.environment is None:
-                of_folder = intrinsics.environment, "keep", intrinsics.specular, intrinsics.diffuse
-                intrinsics = under_light(intrinsics, *of_folder, shadows=self.shadows)
+                of_folder = intrinsics.require("environment")["environment"]
+                known = intrinsics.specular, intrinsics.diffuse
+                intrinsics = under_light(intrinsics, of_folder, "keep", *known, shadows=self.shadows)
             meta["remarks"] = remarks | parts_left_out(intrinsics.mask, self.model.side(pipeline))
             for remark in meta["remarks"].values():
                 notice(remark)

@@ -47,21 +47,21 @@ def mixture_explains(image_srgb: Float[np.ndarray, "h w 3"], mask: Float[np.ndar
     if 2 * brighter.sum() <= both.sum():
         return 0.0
     uncovered = 1 - mask[rim][brighter]
-    shown = [image_srgb[place][brighter].astype(np.float64) for place in (rim, whole, none)]
-    if np.square(uncovered * (shown[2] - shown[1])).mean() < LEAST_DIFFERENCE**2:
+    s, f, b = (image_srgb[place][brighter].astype(np.float64) for place in (rim, whole, none))
+    if np.square(uncovered * (b - f)).mean() < LEAST_DIFFERENCE**2:
         return 0.0
-    return max(_explained(*shown, uncovered), _explained(*map(srgb_decode, shown), uncovered))
+    in_linear_light = _explained(srgb_decode(s), srgb_decode(f), srgb_decode(b), uncovered)
+    return max(_explained(s, f, b, uncovered), in_linear_light)
 
 
 def _explained(
-    seen: Float[np.ndarray, "k 3"],
-    inside: Float[np.ndarray, "k 3"],
-    behind: Float[np.ndarray, "k 3"],
+    s: Float[np.ndarray, "k 3"],
+    f: Float[np.ndarray, "k 3"],
+    b: Float[np.ndarray, "k 3"],
     uncovered: Float[np.ndarray, "k 1"],
 ) -> float:
-    difference = seen - inside
-    power = np.square(difference).sum()
-    return 0.0 if power == 0 else float(1 - np.square(difference - uncovered * (behind - inside)).sum() / power)
+    power = np.square(s - f).sum()
+    return 0.0 if power == 0 else float(1 - np.square(s - f - uncovered * (b - f)).sum() / power)
 
 
 def without_background(
