@@ -198,11 +198,34 @@ def test_an_edited_package_elsewhere_is_another_configuration(tmp_path: Path, mo
         f"import sys\nsys.path.append({str(package.parent)!r})\nfrom my_edited_package import Net\n"
         "class Mine:\n    name, config = 'mine', {}\n    def render(self, intrinsics): ..."
     )
-    before = named_plugin(f"{file}:Mine").source
+    kind = type(named_plugin(f"{file}:Mine").method)
+    before = source_sha256(kind, kind)
     (package / "other.py").write_text("# edited")
-    assert named_plugin(f"{file}:Mine").source == before
+    assert source_sha256(kind, kind) == before
     (package / "net.py").write_text("class Net: ...  # edited")
-    assert named_plugin(f"{file}:Mine").source != before
+    assert source_sha256(kind, kind) != before
+
+
+def test_a_method_that_was_edited_after_its_import_is_refused(folder: Path) -> None:
+    """As the second run of a notebook has it: Python would run the old one, under the name of the new one's file."""
+    named_plugin(f"{folder / 'my_method.py'}:Grey")
+    named_plugin(f"{folder / 'my_method.py'}:Grey")
+    (folder / "my_method.py").write_text(SOURCE.replace("return SHADE", "return 2 * SHADE"))
+    with pytest.raises(UnirenderError, match=r"my_method\.py:Grey: its files were edited after .* restart the kernel"):
+        named_plugin(f"{folder / 'my_method.py'}:Grey")
+
+
+def test_a_method_of_a_session_is_refused(tmp_path: Path) -> None:
+    """It has no file, so that the stored numbers would count for an edited one, too."""
+    session = (
+        "from unirender_evaluation.methods.plugins import named_plugin\n"
+        "class Mine:\n    name, config = 'mine', {}\n    def render(self, intrinsics): ...\n\n"
+        "named_plugin('__main__:Mine')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-"], input=session, cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert "--method __main__:Mine: Mine is defined in no file, expected one" in done.stderr
 
 
 def test_neighbours_of_one_name_are_not_mistaken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

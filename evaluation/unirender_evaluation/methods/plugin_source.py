@@ -20,22 +20,31 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from unirender.errors import UnirenderError
+
 INSTALLED = ("site-packages", "dist-packages")
 STANDARD_LIBRARY = Path(sysconfig.get_path("stdlib")).resolve()
 OURS = ("unirender", "unirender_evaluation", "unirender_reference")  # which have versions of their own
 
 
 def source_sha256(kind: type, *makers: Any) -> str:
-    """The sha256 of the contents of a method's files; "unknown" where there are none: what is compiled, or made in a
-    session.
+    """The sha256 of the contents of a method's files.
 
     Args:
         kind: the method's class.
         *makers: what was called to make it, and the module that has it.
+
+    Raises:
+        UnirenderError: it has none, as what is defined in a session: an edited one could not be told from it.
     """
     files, _ = _files_and_roots(kind, makers)
+    if not files:
+        raise UnirenderError(
+            f"{kind.__qualname__} is defined in no file, expected one, since an edited method is told by its file; in "
+            "a notebook write the class with %%writefile my_method.py"
+        )
     contents = sorted(hashlib.sha256(file.read_bytes()).digest() for file in files)
-    return hashlib.sha256(b"".join(contents)).hexdigest() if contents else "unknown"
+    return hashlib.sha256(b"".join(contents)).hexdigest()
 
 
 def raised_in(error: BaseException) -> str:

@@ -35,6 +35,7 @@ FORM = "module:Class or path/to/file.py:Class"
 ARGUMENTS = "?name=value&name=value"
 BOOLEANS = {"true": True, "false": False}
 _SET_BY: dict[str, OwnDefaults] = {}  # by name of a module: what its import has set; it is imported once
+_READ: dict[tuple[str, ...], str] = {}  # by names of module and class: sha256 of the files, as they were imported
 
 
 @dataclass(frozen=True)
@@ -241,8 +242,14 @@ def _plugin(
     method: Any = found if as_it_is else _attempt(what, "construct it", lambda: found(**arguments), defaults)
     try:
         check_method(method)
+        source = source_sha256(type(method), found, module)
     except UnirenderError as error:
         raise UnirenderError(f"{what}: {error}") from None
+    if source != _READ.setdefault((module.__name__, name, type(method).__module__, type(method).__qualname__), source):
+        raise UnirenderError(
+            f"{what}: its files were edited after this process had imported them, and it would run as it was; start "
+            "Python anew (in a notebook: restart the kernel)"
+        )
     for beside, other in shadowed(type(method), found, module):
         raise UnirenderError(
             f"{what}: in place of {beside} Python imports {other}; rename one of them, or, where the other is another "
@@ -251,4 +258,4 @@ def _plugin(
         )
     said = {argument: str(value) for argument, value in arguments.items()}
     made_by = {"class": type(method).__qualname__, "name": name, "arguments": said}
-    return Plugin(method, source_sha256(type(method), found, module), made_by, defaults)
+    return Plugin(method, source, made_by, defaults)
