@@ -1,5 +1,7 @@
 """Layers: what may import what (the oracle is independent of what it judges); each contract with its failing twin."""
 
+import importlib
+import pkgutil
 import re
 import shutil
 import subprocess
@@ -76,6 +78,16 @@ def test_the_shared_vocabulary_imports_nothing_heavy(tmp_path: Path) -> None:
     modules = ", ".join(sorted(VOCABULARY))
     loaded = run_python(f"import sys, {modules}; print(*sorted({{m.split('.')[0] for m in sys.modules}}))", tmp_path)
     assert not set(HEAVY) & set(loaded.split())
+
+
+@pytest.mark.parametrize("name", PACKAGES.values())
+def test_what_a_package_exports_is_there_and_loads_nothing_before(name: str, tmp_path: Path) -> None:
+    """Nor is it named as one of the package's modules, which would take its place when it is imported."""
+    loaded = run_python(f"import sys, {name}; print(*sorted({{m.split('.')[0] for m in sys.modules}}))", tmp_path)
+    assert not {*HEAVY, "numpy"} & set(loaded.split())
+    package = importlib.import_module(name)
+    assert not {module.name for module in pkgutil.iter_modules(package.__path__)} & set(package.__all__)
+    assert all(hasattr(package, exported) for exported in package.__all__)
 
 
 def test_of_two_modules_that_need_each_other_either_can_come_first(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ A picture is what a camera would store: 8-bit sRGB. No other truth reaches a met
 everywhere. A row that is told more declares it (`rows.Row.told`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import Any
 
@@ -72,7 +72,7 @@ def scene_ids(suite: Suite, limit: int | None) -> list[Scene]:
     return [scenes[i] for i in np.linspace(0, len(scenes) - 1, limit).round().astype(int)]
 
 
-def tasks(suite: Suite, table: str, protocol: str, scenes: list[Scene]) -> Iterator[Task]:
+def tasks(suite: Suite, table: str, protocol: str, scenes: Iterable[Scene]) -> Iterator[Task]:
     """All questions of one protocol, scene by scene.
 
     Raises:

@@ -28,6 +28,7 @@ from unirender.visualization import write_png
 from unirender_evaluation.export import export_inputs
 from unirender_evaluation.predictions.check import folder_problems, questions
 from unirender_evaluation.predictions.folder import PredictionFolder
+from unirender_evaluation.subsets import Subsets
 from unirender_reference.dataset import generate
 from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.render import Renderer
@@ -136,12 +137,19 @@ def stranger() -> Names:
     """The inputs of a tiny suite, and the arguments of the script that the page shows."""
     export_inputs(make_suite(Path("suite")), Path("inputs"))
     sys.argv[:] = ["predict.py", "inputs", "predictions"]
-    return {}
+    return {"LITTLE": Subsets(0, 1, 1, 0, 0, 0, 0)}
 
 
 def check_predictions(names: Names) -> None:
     suite = make_suite(Path("again"))
     assert not folder_problems(PredictionFolder(Path("predictions")), questions(suite), "ball")
+    rows = {row.pop("method"): row for row in names["rows"]}
+    own, folder = rows["retinex"]["albedo.psnr@masked-srgb-raw"], rows["mine"]["albedo.psnr@masked-srgb-raw"]
+    assert own.mean == pytest.approx(folder.mean, abs=1e-4)
+    of_samples = [record.values for record in names["result"].records if record.method == "retinex"]
+    assert names["values"]["albedo.psnr@masked-srgb-raw"] in [
+        values.get("albedo.psnr@masked-srgb-raw") for values in of_samples
+    ], "a question's score is that of the run"
 
 
 def other_method() -> Names:
@@ -292,7 +300,15 @@ EXAMPLES = {
     "passes.md": Example(lobes, {"spp=1152": "spp=144"}),
     "physics.md": Example(check=printed_as_said),
     "results_format.md": Example(predicted, check=check_score),
-    "score_your_method.md": Example(stranger, check=check_predictions),
+    "score_your_method.md": Example(
+        stranger,
+        {
+            '"tiny"': '"suite/ball.toml"',
+            "scenes[:2]": "scenes[:1]",
+            "limit=2": "limit=1, check_scenes=0, jobs=0, subsets=LITTLE",
+        },
+        check_predictions,
+    ),
     "shade.md": Example(shaded, {"spp=256": "spp=16", "spp=64": "spp=16"}, check_gradients),
     "your_files.md": Example(other_method, check=check_gathered),
     "tour.md": Example(mug, {"resolution=128": "resolution=32", "spp=256": "spp=16"}, check_tour),
