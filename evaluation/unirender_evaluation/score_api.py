@@ -155,8 +155,12 @@ def _array(value: Any, what: str, channels: int, meaning: str) -> Float[np.ndarr
             f"score: {what} is a torch tensor, expected a numpy array with the channels last: "
             "`x.detach().cpu().movedim(-3, -1).numpy()` of one picture"
         )
+    if isinstance(getattr(value, "mean", None), np.ndarray):
+        raise UnirenderError(f"score: {what} is {type(value).__name__}, expected an array, as its `mean` is")
     found = np.asarray(value)
     wanted = f"floats of shape (h, w, {channels}), {meaning}"
+    if found.ndim == 3 and (found.shape[-1], channels) == (4, 3):
+        wanted += "; the alpha of a render is left out by [..., :3]"
     if found.ndim == 3 and found.shape[-1] != channels and found.shape[0] == channels:
         wanted += "; the channels come last"
     if found.ndim == 4:

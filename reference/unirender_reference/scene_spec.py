@@ -11,9 +11,14 @@ from jaxtyping import Float
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics
-from unirender.shown import short_repr
+from unirender.shown import in_short, short_repr
 from unirender_reference.lights import Light
 from unirender_reference.shapes import MeshObject
+
+HINTS = {
+    "obj": "; load_mesh reads a file",
+    "light": "; load_light reads a file, Light(name, environment) takes an array",
+}
 
 
 @dataclass(frozen=True)
@@ -45,14 +50,22 @@ class SceneSpec:
         for name, kind in {**kinds, "roughness": Real | None, "metallic": Real | None}.items():
             if not isinstance(value := getattr(self, name), kind):
                 expected = getattr(kind, "__name__", "a number, or None for the object's own map")
-                raise UnirenderError(f"scene: got {name} {value!r:.60}, expected {expected}")
+                got = in_short(value) if isinstance(value, np.ndarray) else f"{value!r:.60}"
+                raise UnirenderError(f"scene: got {name} {got}, expected {expected}{HINTS.get(name, '')}")
         if self.exposure_seed < 0:
             raise UnirenderError(f"scene: got exposure_seed {self.exposure_seed}, expected a seed of at least 0")
 
 
 @dataclass(frozen=True)
 class Sample:
-    """A rendered scene: `image_linear` premultiplied (h, w, 3), complete `intrinsics`, the variance of the means."""
+    """A rendered scene.
+
+    Attributes:
+        image_linear: premultiplied by the mask.
+        intrinsics: all maps, and the light as it was rendered: exposed, in camera axes.
+        variance: of the means of "image", "specular" and "diffuse", per pixel and channel.
+        provenance: what rendered it, of what, as text: the header of its files.
+    """
 
     image_linear: Float[np.ndarray, "h w 3"]
     intrinsics: Intrinsics

@@ -29,7 +29,7 @@ from unirender.light.resampling import resample_environment
 from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 from unirender.scene_export import export_scene
 from unirender.light.surface_light import diffuse_light, specular_light
-from unirender_evaluation import Variant, read_results, score
+from unirender_evaluation import BenchConfig, Variant, read_results, score
 from unirender_evaluation.scoring import score_maps
 from unirender_evaluation.suites.suite import load_suite
 from unirender_reference.denoise import denoise
@@ -194,6 +194,14 @@ CASES = {
     "shade_gradients(maps, image, light, wrt='gloss')": "shade_gradients: got wrt=('gloss',), expected some of albedo,",
     "SceneSpec(renderer.obj, make_light(1, 'train'), 'a', 0.0)": "scene: got roughness 'a', expected a",
     "SceneSpec('ball', make_light(1, 'train'), 0.5, 0.0)": "scene: got obj 'ball', expected MeshObject",
+    "SceneSpec(renderer.obj, light, 0.5, 0.0)": "scene: got light [16, 32, 3] in [1, 1], expected Light; load_light",
+    "BenchConfig(out='results')": "benchmark: got out='results', expected pathlib.Path",
+    "BenchConfig(methods='trivial')": "benchmark: got methods='trivial', expected tuple[str, ...]",
+    "BenchConfig(method=(Camera,))": "benchmark: got method=(<class 'unirender.camera.Camera'>,), expected tuple[str,",
+    "BenchConfig(predictions={'a': 'b'})": "benchmark: got predictions={'a': 'b'}, expected dict[str, pathlib.Path]",
+    "BenchConfig(variants=('masked',))": "benchmark: got variants=('masked',), expected tuple[unirender_evaluation.",
+    "score(renderer.image(light, 0.5, 0.5, 16), image, mask=mask)": "score: the prediction is Estimate, expected an",
+    "score(np.dstack([image, mask]), image, mask=mask)": "score: the prediction is float32 of shape (16, 24, 4), exp",
     "make_object('a', 'train')": "make_object: got seed 'a', split 'train'; expected seed >= 0",
     "UniRenderPipeline.from_pretrained(123)": "checkpoint: got 123, expected the path of a pipeline folder",
     "pipeline.render(maps, derived='shadow')": "derived: got shadow, expected names out of",

@@ -80,6 +80,12 @@ class BenchResult:
     asked: int
     computed: int
 
+    def __repr__(self) -> str:
+        return (
+            f"BenchResult(suite {self.run.suite}, {len(self.run.methods)} rows, {len(self.tables)} tables, "
+            f"{self.computed} new records of {self.asked})"
+        )
+
 
 def run(config: BenchConfig, console: Console | None = None) -> BenchResult:
     """Runs or continues a benchmark and writes its folder (see the module).

@@ -1,10 +1,11 @@
 """What a benchmark run is asked for: its settings, and the rows that follow from them."""
 
+import inspect
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from unirender.errors import UsageError
+from unirender.errors import UnirenderError, UsageError
 from unirender.shipped import checkpoint_folder, checkpoint_sha256, shipped_for
 from unirender_evaluation import bounds
 from unirender_evaluation.claims import OURS
@@ -31,7 +32,11 @@ BOUNDS = (  # keys that no row of a stranger may have
 
 @dataclass(frozen=True)
 class BenchConfig:
-    """A benchmark run: the options of `bench run` (`runs.command.BenchRun`), taken apart."""
+    """A benchmark run: the options of `bench run` (`runs.command.BenchRun` describes them), taken apart.
+
+    Raises:
+        UnirenderError: one is of another type.
+    """
 
     suite: str = "tiny"
     out: Path = Path("results")
@@ -50,11 +55,31 @@ class BenchConfig:
     subsets: Subsets = STANDARD  # scenes of the slow parts
     variants: tuple[Variant, ...] | None = None  # of the tables (`build_tables`); records have all of them
 
+    def __post_init__(self) -> None:
+        fits = {
+            "suite": isinstance(self.suite, str),
+            "out": isinstance(self.out, Path),
+            "checkpoint": isinstance(self.checkpoint, Path | None),
+            "methods": _are(self.methods, str),
+            "method": _are(self.method, str),
+            "predictions": isinstance(self.predictions, dict) and _are((*self.predictions.values(),), Path),
+            "variants": self.variants is None or _are(self.variants, Variant),
+        }
+        for name, fit in fits.items():
+            if not fit:
+                expected = inspect.formatannotation(type(self).__annotations__[name])
+                hint = "; name a class by its file: 'my_method.py:MyMethod'" if name == "method" else ""
+                raise UnirenderError(f"benchmark: got {name}={getattr(self, name)!r:.60}, expected {expected}{hint}")
+
     def weights(self) -> Path:
         """The folder of our model."""
         if self.checkpoint is None:
             return shipped_for(read_spec(self.suite).resolution)
         return checkpoint_folder(self.checkpoint)
+
+
+def _are(values: Any, kind: type) -> bool:
+    return isinstance(values, tuple) and all(isinstance(value, kind) for value in values)
 
 
 def build_rows(config: BenchConfig) -> list[Row]:
