@@ -31,7 +31,6 @@ from unirender_evaluation.predictions.folder import PredictionFolder
 from unirender_evaluation.subsets import Subsets
 from unirender_reference.dataset import generate
 from unirender_reference.dataset_config import DatasetConfig
-from unirender_reference.render import Renderer
 
 Names = dict[str, Any]
 
@@ -77,6 +76,7 @@ def check_tour(names: Names) -> None:
     np.testing.assert_array_equal(names["edited"].albedo, names["stored"].mask * np.array([1, 0, 0]))
     assert names["chrome"].coarse_share == 1.0, "the page says 1.0"
     assert names["again"].shape == (64, 64, 3)
+    assert np.abs(names["other"] - names["again"]).mean() > 0.01, "under another light"
 
 
 def lights(folder: str, count: int) -> None:
@@ -120,8 +120,18 @@ def check_meshes(names: Names) -> None:
     assert names["obj"].name == "0042"
 
 
-def lobes() -> Names:
-    return {"renderer": Renderer(sphere(subdivisions=2), resolution=8), "environment": environment()}
+def own_mesh_and_light() -> Names:
+    import trimesh
+
+    trimesh.creation.icosphere(subdivisions=2).export("mug.glb")
+    write_exr(Path("hall.exr"), image_channels(environment()), half=False)
+    return {}
+
+
+def check_passes(names: Names) -> None:
+    assert names["shadow"].shape == (8, 8, 4)
+    assert names["shadow"][..., :3].max() <= 0
+    assert names["metal"].shape == (8, 8, 3)
 
 
 def predicted() -> Names:
@@ -198,6 +208,7 @@ def shaded() -> Names:
 def check_gradients(names: Names) -> None:
     assert names["image"].shape == (16, 16, 3)
     assert np.abs(names["gradients"].albedo).max() > 0
+    assert names["losses"][-1] < 0.4 * names["losses"][0]
 
 
 class MyTracker(GeneralTracker):
@@ -297,7 +308,7 @@ EXAMPLES = {
         },
         check_optimized,
     ),
-    "passes.md": Example(lobes, {"spp=1152": "spp=144"}),
+    "passes.md": Example(own_mesh_and_light, {"spp=1152": "spp=144", "resolution=128": "resolution=8"}, check_passes),
     "physics.md": Example(check=printed_as_said),
     "results_format.md": Example(predicted, check=check_score),
     "score_your_method.md": Example(
