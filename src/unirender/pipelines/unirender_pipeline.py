@@ -239,7 +239,8 @@ class UniRenderPipeline(DualStreamPipeline):
                 missing. Light is expected as bright as in the training data (white near display white): the error of
                 the network does not shrink with it, so scale a dim light up, and the picture down. A missing mask is
                 where the normal is not 0 (the whole frame where it is 0 nowhere); missing s and d are derived from the
-                environment where it is given.
+                environment where it is given. Those that are there count, whatever it is: under another light
+                `intrinsics.replace(environment=light, specular=None, diffuse=None)` is rendered.
             mode: as for `decompose`, like the other settings.
             num_inference_steps: of `sample`.
             num_samples: of `sample`.
