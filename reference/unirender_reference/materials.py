@@ -19,7 +19,6 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from unirender.errors import UnirenderError
 from unirender_reference.backend import mitsuba
 
 INNER = "brdf_0"  # what Mitsuba calls the BSDF inside `twosided`
@@ -34,23 +33,8 @@ def base_color_bitmap(albedo_linear: Float[np.ndarray, "*size 3"]) -> dict[str, 
     Args:
         albedo_linear: one colour (3,) or a picture (h, w, 3), linear Rec.709 in [0, 1]. One colour becomes a 2 x 2
             picture, so that every object runs the same compiled kernel.
-
-    Raises:
-        UnirenderError: another shape, or values out of range.
     """
-    albedo = np.asarray(albedo_linear, dtype=np.float32)
-    if albedo.ndim == 1:
-        albedo = np.broadcast_to(albedo, (2, 2, 3))
-    if albedo.ndim != 3 or albedo.shape[-1] != 3:
-        raise UnirenderError(
-            f"albedo: got shape {albedo.shape}, expected (3,) or (height, width, 3); move the channels last"
-        )
-    if not np.isfinite(albedo).all() or albedo.min() < 0 or albedo.max() > 1:
-        raise UnirenderError(
-            f"albedo: got values in [{albedo.min():.4g}, {albedo.max():.4g}], expected finite linear values in [0, 1]; "
-            "divide 8-bit values by 255 and decode them (unirender.color.srgb_decode)"
-        )
-    return _bitmap(albedo)
+    return _bitmap(np.broadcast_to(albedo_linear, (2, 2, 3)) if albedo_linear.ndim == 1 else albedo_linear)
 
 
 def scalar_bitmap(texture: Float[np.ndarray, "h w"]) -> dict[str, Any]:

@@ -109,7 +109,6 @@ def rows_of(run: "RunInfo", records: "Sequence[Record]", methods: Sequence[str])
     Raises:
         UsageError: there is no such row.
     """
-
     keys = [info.key for info in run.methods]
     for name in methods:
         if name not in keys:

@@ -16,7 +16,6 @@ from unirender_reference.meshes.limits import MAX_REPEATS
 from unirender_reference.meshes.surface import Channel, Material, Texture, Wrap, unit_vectors
 
 PERIOD: dict[Wrap, int] = {"repeat": 1, "mirror": 2}
-Maps = Mapping[str, Float[np.ndarray, "h w c"]]
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Tile:
         averaged: whether a texture was replaced by its mean.
     """
 
-    maps: Maps
+    maps: Mapping[str, Float[np.ndarray, "h w c"]]
     uv: Float[np.ndarray, "m 3 2"]
     averaged: bool = False
 

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from unirender.errors import UnirenderError
 from unirender_reference import textures  # which imports `shapes.noise`: whoever comes first finds the other begun
 from unirender_reference.shapes import implicit, parametric
-from unirender_reference.shapes.material_maps import Maps, SolidMaterial, random_material
+from unirender_reference.shapes.material_maps import BakedMaps, SolidMaterial, random_material
 from unirender_reference.shapes.mesh_object import MeshObject, unit_sphere
 from unirender_reference.shapes.surface import AtlasPlace, Part, corner_normals, pack_textures, split_corners
 
@@ -155,7 +155,7 @@ def _finish(
     )
 
 
-def pack_maps(maps: list[Maps]) -> tuple[dict[str, np.ndarray], list[AtlasPlace]]:
+def pack_maps(maps: list[BakedMaps]) -> tuple[dict[str, np.ndarray], list[AtlasPlace]]:
     """The maps of all parts side by side, as fields of `MeshObject`, and where each part's lie."""
     if not maps:
         return {}, []

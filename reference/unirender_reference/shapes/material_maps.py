@@ -25,7 +25,7 @@ Field = Callable[[Float[np.ndarray, "h w 3"]], Float[np.ndarray, "h w"]]
 
 
 @dataclass(frozen=True)
-class Maps:
+class BakedMaps:
     """Baked maps of one part: roughness (perceptual) and metallic in [0, 1], unit normals in tangent space."""
 
     roughness: Float[np.ndarray, "h w"]
@@ -59,7 +59,7 @@ class SolidMaterial:
     noise: ValueNoise
     frequency: float
 
-    def bake(self, position_map: Float[np.ndarray, "h w 3"]) -> Maps:
+    def bake(self, position_map: Float[np.ndarray, "h w 3"]) -> BakedMaps:
         """The maps of a part whose texels show the points of `position_map`.
 
         Raises:
@@ -77,7 +77,7 @@ class SolidMaterial:
         smudge = self.variation * self.noise.fractal(points * 1.7 + 11, 2)
         roughness = np.clip(_mix(self.roughness, share) + smudge, SMOOTHEST, ROUGHEST)
         height = self.relief * share + self.bumps * fine * (1 - share)
-        return Maps(
+        return BakedMaps(
             roughness.astype(np.float32),
             np.clip(_mix(self.metallic, share), 0, 1).astype(np.float32),
             normal_from_height(height, points),

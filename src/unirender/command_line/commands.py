@@ -4,7 +4,7 @@ They know nothing of the ground truth: what reads the light files is passed in b
 """
 
 import contextlib
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -33,6 +33,7 @@ from unirender.system.notices import notice
 if TYPE_CHECKING:
     import numpy as np
 
+    from unirender.intrinsics import Intrinsics
     from unirender.pipelines.results import EditResult
     from unirender.pipelines.unirender_pipeline import UniRenderPipeline
 
@@ -139,7 +140,7 @@ class Render:
         intrinsics = with_edits(stored, self.maps)
         if self.environment is None:
             intrinsics = with_edited_light(stored, intrinsics)
-        self._check_maps(intrinsics.present)
+        self._check_maps(intrinsics)
         with new_folder(self.out.output, overwrite=self.out.overwrite) as folder:
             light = None if self.environment is None else exposed_light(read_light, self.environment, self.exposure)
             pipeline = self.model.load()
@@ -169,7 +170,7 @@ class Render:
         print(f"{self.out.output}")
         return 0
 
-    def _check_maps(self, present: Collection[str]) -> None:
+    def _check_maps(self, intrinsics: "Intrinsics") -> None:
         """Looks at which maps there are.
 
         Raises:
@@ -177,11 +178,10 @@ class Render:
         """
         from unirender.pipelines.rendered_maps import RENDER_NEEDS
 
-        if missing := [name for name in RENDER_NEEDS if name not in present]:
-            files = f"; add a file like {missing[0]}.png" if self.maps.is_dir() else ""
-            raise UnirenderError(
-                f"{self.maps}: {', '.join(missing)} missing, expected at least {', '.join(RENDER_NEEDS)}{files}"
-            )
+        try:
+            intrinsics.require(*RENDER_NEEDS)
+        except UnirenderError as error:
+            raise UnirenderError(f"{self.maps}: {error}") from None
 
     def _memory_remarks(self) -> dict[str, str]:
         """As `memory_remarks` has them, of the maps' size in their header."""

@@ -271,14 +271,13 @@ class UniRenderPipeline(DualStreamPipeline):
         self.maybe_free_model_hooks()
         return image
 
-    def overflow(self, intrinsics: Intrinsics, *, shadows: bool = True) -> dict[str, Overflow]:
+    def overflow(self, intrinsics: Intrinsics) -> dict[str, Overflow]:
         """Which of s, d and environment exceed, at the model's size, the brightest that the network was taught.
 
         Such values are not clipped: they enter above the range of the training data. `render` logs them, once a map.
 
         Args:
             intrinsics: as for `render`.
-            shadows: as for `render`.
 
         Returns:
             By name of the map; {} where nothing does.
@@ -287,9 +286,8 @@ class UniRenderPipeline(DualStreamPipeline):
             UnirenderError: as `render`.
         """
         check_rendered(intrinsics, ())
-        check_switches(shadows=shadows)
         network = self._network()
-        return network.overflow(enter(network, ready_to_render(intrinsics, shadows))[1])
+        return network.overflow(enter(network, ready_to_render(intrinsics))[1])
 
     def edit(
         self,

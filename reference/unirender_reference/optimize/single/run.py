@@ -94,7 +94,7 @@ def optimize_image(
         return make_picture(linear, mask, camera, maps, geometry, pixels, shape, hdr, config.seed, clipped)
 
     coarse = prepared(config.coarse_pixels)
-    fit = Fit(coarse, _start_light(coarse, init, shape), priors, config.noise[0])
+    fit = Fit(coarse, _start_light(init, shape), priors, config.noise[0])
     fit.log_light = fit.log_light + fit.level()
     at = anneal(fit, config.steps, config.noise, config.noise_factor, report)
     fine = prepared(config.pixels) if coarse.block > 1 else coarse
@@ -162,7 +162,7 @@ def _start_normals(
     return normal
 
 
-def _start_light(picture: PicturePixels, init: Intrinsics | None, shape: tuple[int, int]) -> Float[np.ndarray, "j 3"]:
+def _start_light(init: Intrinsics | None, shape: tuple[int, int]) -> Float[np.ndarray, "j 3"]:
     """Log radiance of the start; even light where nothing is predicted."""
     if init is None:
         return np.zeros((shape[0] * shape[1], 3))

@@ -21,14 +21,13 @@ from scipy.sparse import block_diag
 from torch import Tensor
 
 from unirender.errors import UnirenderError
+from unirender.models.packing import Maps
 from unirender.training.augmentations.environments import ANGLE_STEP, small_turn_operator
 
 ROLL_DEG = 25.0  # at most, either way
 ZOOM = 0.18  # at most, the logarithm
 SHIFT = 0.06  # at most, of the frame, one way
 LEAST_COVERAGE = 1e-3  # less is a rounding error of where a pixel comes from
-
-Maps = dict[str, Tensor]
 
 
 @dataclass(frozen=True)
