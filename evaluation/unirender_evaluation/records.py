@@ -138,6 +138,10 @@ class RunInfo:
     environment: Mapping[str, str] = field(default_factory=dict)  # versions, CPU
     schema: int = SCHEMA_VERSION
 
+    def __repr__(self) -> str:
+        when = self.date or "no date"
+        return f"RunInfo(suite {self.suite} at {self.resolution} px, {when}, {len(self.methods)} methods)"
+
     def method(self, key: str) -> MethodInfo:
         """Returns the row of that key; raises UnirenderError if the run has none."""
         for info in self.methods:

@@ -15,7 +15,9 @@ from unirender.pictures import Picture
 from unirender.pipelines.results import Decomposition, EditResult
 from unirender.shown import in_short
 from unirender.training.data.dataset import GroupDataset
+from unirender_evaluation.runs.benchmark import BenchResult
 from unirender_evaluation.suites.suite import load_suite
+from unirender_evaluation.tables.build import build_tables
 from unirender_reference.optimize.views import View
 from unirender_reference.passes import Estimate
 from unirender_reference.render import Renderer, Sample, SceneSpec
@@ -39,6 +41,9 @@ CASES: list[tuple[Any, str]] = [
     (Gradients(roughness=MASK), "Gradients(roughness [16, 16, 1] in [1, 1])"),
     (View(IMAGE, MASK, Camera(), np.eye(4)), "View(image [16, 16, 3] in [0, 1], mask [16, 16, 1] in [1, 1], camera="),
     (small_results(), "Results(a: suite "),
+    (small_results().run, "RunInfo(suite "),
+    (build_tables(small_results().records, small_results().run)[0], "Table(Inverse rendering: from the image"),
+    (BenchResult(tuple(small_records()), small_results().run, (), "", {}, 2, 1), "BenchResult(suite "),
     (load_suite("tiny"), "Suite(tiny, 48 scenes at 64 px)"),
 ]
 

@@ -160,6 +160,14 @@ def test_limited_runs_take_scenes_evenly(suite: Suite) -> None:
         scene_ids(suite, 0)
 
 
+def test_a_material_that_a_suite_does_not_store_is_told_with_those_that_it_does(suite: Suite) -> None:
+    scene = suite.scenes[0]
+    said = r"got \(metallic, roughness\) \(0\.15, 0\.3\), expected one of ball-0_l0: \(0\.5, 0\.5\), "
+    for picture in (suite.image, suite.image_variance):
+        with pytest.raises(UnirenderError, match=said):
+            picture(scene, (0.15, 0.3))
+
+
 def test_scenes_have_twins_where_the_suite_says(suite: Suite) -> None:
     first, second = suite.scenes[:2]
     base, rough = suite.spec.base, suite.spec.base[1]

@@ -99,6 +99,15 @@ class Suite:
         self._cache.move_to_end(name)
         return self._cache[name]
 
+    def _image_member(self, scene: Scene, material: MetallicRoughness) -> str:
+        stored = (self.spec.base, *self.spec.edits, *scene.materials)
+        if material_key(material) not in map(material_key, stored):
+            raise UnirenderError(
+                f"suite {self.spec.name!r}: got (metallic, roughness) {material}, expected one of {scene.key}: "
+                f"{', '.join(map(str, stored))}"
+            )
+        return image_member(scene.key, material)
+
     def _mean(self, name: str) -> Float[np.ndarray, "h w 3"]:
         return estimate_mean(member_kind(name), self._channels(name))
 
@@ -160,12 +169,16 @@ class Suite:
         return same[(same.index(scene) + 1) % len(same)]
 
     def image(self, scene: Scene, material: MetallicRoughness) -> Float[np.ndarray, "h w 3"]:
-        """Linear image, premultiplied by coverage."""
-        return self._mean(image_member(scene.key, material))
+        """Linear image, premultiplied by coverage.
+
+        Raises:
+            UnirenderError: the material is neither the base nor an edit of the suite, nor one of the scene's.
+        """
+        return self._mean(self._image_member(scene, material))
 
     def image_variance(self, scene: Scene, material: MetallicRoughness) -> Float[np.ndarray, "h w 3"]:
         """Variance of the stored mean, same units squared."""
-        return self._variance(image_member(scene.key, material))
+        return self._variance(self._image_member(scene, material))
 
     def diffuse_variance(self, scene: Scene) -> Float[np.ndarray, "h w 3"]:
         """The same of d."""

@@ -81,6 +81,9 @@ class Table:
     watermark: str | None = None
     n: int = 0
 
+    def __repr__(self) -> str:
+        return f"Table({self.heading}: {len(self.rows)} rows, {len(self.columns)} columns)"
+
     @property
     def published_columns(self) -> tuple[bool, ...]:
         """For each column, whether any row has a published value."""
