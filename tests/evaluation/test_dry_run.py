@@ -70,15 +70,23 @@ def test_what_is_stored_and_what_is_missing(config: BenchConfig) -> None:
     assert sum(found.stored + found.missing for found in planned(config).rows) == len(jobs(config))
 
 
-def test_answers_of_two_versions_of_a_method_may_be_stored(config: BenchConfig, tmp_path: Path) -> None:
+def test_answers_of_two_versions_of_a_method_may_be_stored(
+    config: BenchConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A run that is continued keeps those of each."""
     file = tmp_path / "guess.py"
+
+    def edit(text: str) -> None:
+        """Before a process of its own begins, which has imported no other."""
+        file.write_text(text)
+        monkeypatch.setattr("unirender_evaluation.methods.plugins._READ", {})
+
     for _ in range(2):
         store_some(config, "guess", 2)
         Store.open(config.out / "records.jsonl").close()
-        file.write_text(f"{file.read_text()}# edited\n")
+        edit(f"{file.read_text()}# edited\n")
     assert row(config, "guess").stored == 0
-    file.write_text(file.read_text().removesuffix("# edited\n"))
+    edit(file.read_text().removesuffix("# edited\n"))
     assert row(config, "guess").stored == 2
 
 
