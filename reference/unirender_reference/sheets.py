@@ -39,7 +39,7 @@ def table_sheet(
     words = (line for label in column_labels for line in label.splitlines())
     width = max(*(round(font.getlength(line)) for line in words), *(tile.shape[1] for row in rows for tile in row))
     left = max(round(font.getlength(line)) for label in row_labels for line in label.splitlines()) + 2 * GAP
-    top = LINE * max(len(label.splitlines()) for label in column_labels) + GAP
+    top = LINE * max(label.count("\n") + 1 for label in column_labels) + GAP
     size = (left + len(column_labels) * (width + GAP), top + len(rows) * (height + GAP))
     sheet, draw = _blank(size)
     for j, label in enumerate(column_labels):

@@ -141,7 +141,7 @@ def test_lights_are_shown_as_balls_and_ranked_by_their_error(suite: Suite, tmp_p
         records.append(Record("light", "light-from-image", "mine", task.sample, task.scene.object, values))
     items = pictures.items(records, "mine")
     assert (items[0].rank, items[0].sample) == ("worst", asked[-1].sample)  # the largest error
-    assert items[0].figure == f"error {0.1 + 0.2 * (len(asked) - 1):.2f}"
+    assert items[0].figure == f"matte ball error {0.1 + 0.2 * (len(asked) - 1):.2f}"
     worst = items[0]
     assert list(worst.truth) == ["matte ball", "glossy ball", "mirror ball"]
     for name, picture in worst.truth.items():

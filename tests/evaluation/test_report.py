@@ -100,6 +100,20 @@ def test_commands_in_notes_are_set_as_code(tmp_path: Path) -> None:
     assert "<li>&lt;x&gt;: <code>make x</code> fetches it</li>" in page
 
 
+def test_pictures_come_before_verdicts_and_the_contents_are_in_the_order_of_the_page(page: str) -> None:
+    sections = re.findall(r'<section id="(\w+)">', page)
+    assert sections == ["standing", "tables", "gallery", "distributions", "verdicts", "samples"]
+    assert re.findall(r'<a href="#(\w+)">', page) == sections
+
+
+def test_the_pictures_at_its_head_stand_in_rows_that_say_which_is_the_truth(page: str) -> None:
+    (head,) = re.findall(r'<table class="hero".*?</table>', page, re.DOTALL)
+    assert re.findall(r'<th scope="col">(\w+)</th>', head) == ["image", "albedo", "normal"]
+    rows = re.findall(r'<th scope="row">(\w+)</th>(.*?)</tr>', head)
+    pictures = [(name, re.findall(r'alt="([\w ]*)"', cells)) for name, cells in rows]
+    assert pictures == [("found", ["image", "albedo", "normal"]), ("truth", ["true albedo", "true normal"])]
+
+
 def test_failures_come_first_and_are_named_with_their_figures_and_questions(page: str) -> None:
     cards = re.findall(r'<h4><span class="rank">(.*?)</span>(.*?)</h4>', page)
     assert cards == [("worst of 6: PSNR 1 dB", "question bad"), ("best of 6: PSNR 6 dB", "question good")]
@@ -191,8 +205,8 @@ def test_tables_say_what_they_and_their_headings_are(page: str) -> None:
     cells = Cells(page)
     assert {attrs.get("scope") for attrs in cells.all("th")} == {"col", "colgroup", "row", "rowgroup"}
     labels = [attrs.get("aria-label") for attrs in cells.all("table")]
-    assert labels[:2] == [f"Inverse rendering: from the image, {tab}" for tab in
-                          ("whole frame, beside the paper", "inside the mask")]  # fmt: skip
+    assert labels[:3] == ["What was found, and the truth", *(f"Inverse rendering: from the image, {tab}" for tab in
+                          ("whole frame, beside the paper", "inside the mask"))]  # fmt: skip
     assert all(labels)
     scrolling = cells.all("div", class_="scroll")
     assert len(scrolling) == len(labels)
@@ -307,7 +321,7 @@ def test_a_tile_has_the_best_of_our_rows_that_are_complete(quantity: str, metric
 
 def test_a_scale_with_a_ceiling_ends_there_and_prints_its_n() -> None:
     tile = tile_of("Albedo", {"input": [10.0] * 3, "ours": [20.0] * 3, "ceiling": [50.0]}, "albedo", "psnr")
-    assert (tile["end"], tile["end_kind"]) == ("Noise ceiling 50.00 (n\xa0=\xa01)", "ceiling")
+    assert (tile["end"], tile["end_kind"]) == ("Noise ceiling: 50.00 (n\xa0=\xa01)", "ceiling")
     assert [mark["at"] for mark in tile["marks"]] == ["25.0"]
 
 

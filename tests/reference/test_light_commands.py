@@ -218,6 +218,14 @@ def test_sheets_hold_their_tiles_and_labels() -> None:
     assert (table[:, 10:30] < 100).any()  # the row's label
 
 
+def test_no_heading_sticks_out_of_a_sheet_also_where_its_last_line_is_empty() -> None:
+    """`views.png` of one picture has its name above an empty line."""
+    tile = np.full((10, 80, 3), 1, np.float32)
+    one, two = (np.asarray(table_sheet([[tile]], ["row"], [label])) for label in ("picture", "picture\n"))
+    assert len(two) == len(one) + LINE
+    assert ((one < 100).any(axis=-1).sum()) == ((two < 100).any(axis=-1).sum()), "as much ink"
+
+
 def test_captions_are_broken_between_words_not_cut() -> None:
     tile, line = np.ones((10, 80, 3), np.float32), LINE
     low, high = (captioned_sheet([tile, tile], [words, "a"], 2) for words in ("twins", "train, CC0, twins studio"))

@@ -103,6 +103,30 @@ def test_a_phone_breaks_no_word_of_the_published_names(page: Path, tmp_path: Pat
         assert "GaussianShader" in phone.ask(broken), "the twin"
 
 
+def test_the_contents_stay_in_sight_and_cover_no_heading(desk: Browser) -> None:
+    bar = "return document.querySelector('.bar').getBoundingClientRect()"
+    for name in ("tables", "samples"):
+        desk.ask("document.documentElement.style.scrollBehavior = 'auto'")
+        desk.click(f".bar a[href='#{name}']")
+        assert desk.ask(bar)["top"] == 0
+        heading = desk.ask("return document.querySelector(arguments[0]).getBoundingClientRect()", f"#{name} h2")
+        assert desk.ask(bar)["bottom"] <= heading["top"]
+    desk.ask("document.querySelector('.bar').style.position = 'static'")
+    assert desk.ask(bar)["bottom"] < 0, "the twin"
+
+
+def test_the_name_of_a_sample_is_on_one_line(desk: Browser) -> None:
+    """Also where its table is wider than the page: a hyphen is no place to break it."""
+    lines = """const cell = document.querySelector('#sample-rows > tbody th'), text = document.createRange();
+        cell.firstChild.textContent = 'test-000019_l0_m100_r050';
+        document.querySelectorAll('#sample-rows tr > td').forEach(other => { other.style.minWidth = '600px'; });
+        cell.style.whiteSpace = arguments[0];
+        text.selectNodeContents(cell.firstChild);
+        return text.getClientRects().length"""
+    assert desk.ask(lines, "") == 1
+    assert desk.ask(lines, "normal") == 2, "the twin"
+
+
 def test_on_paper_every_column_is_within_the_page(tmp_path: Path) -> None:
     wide = """return [...document.querySelectorAll('table')].filter(table =>
         table.getBoundingClientRect().right > document.documentElement.clientWidth + 1).length"""

@@ -4,7 +4,7 @@ What the second one says is computed by the code that it explains: the pixels' r
 """
 
 from io import BytesIO
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -116,7 +116,7 @@ def _picture(axes: "Axes", camera: Camera) -> None:
     side = 192
     normal = ball(camera, side)
     axes.imshow(over_white(map_picture("normal", normal), np.any(normal != 0, axis=-1, keepdims=True) * np.float32(1)))
-    middle, reach = camera.principal[0] * side, 0.34 * side
+    middle, reach = camera.principal[0] * side, 0.28 * side
     _axis(axes, "+x", (middle + reach, middle), (middle, middle))
     _axis(axes, "+y", (middle, middle - reach), (middle, middle))
     axes.text(middle + 4, middle + 12, "+z: towards you", fontsize=8, color=INK)
@@ -134,7 +134,7 @@ def _environment(axes: "Axes") -> None:
     for direction in ("+x", "-x", "+y", "-y", "+z", "-z"):
         for u, v in texel_of(direction):
             inside = (min(max(u, 0.035), 0.965), min(max(v, 0.07), 0.93))
-            axes.text(*inside, direction, fontsize=11, ha="center", va="center", color=INK, weight="bold")
+            axes.text(*inside, direction, color=INK, **_name())
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1])
     axes.set_yticks([0, 1], ["row 0", "row H - 1"])
     axes.tick_params(labelsize=8)
@@ -160,4 +160,12 @@ def _axis(axes: "Axes", name: str, end: tuple[float, float], start: tuple[float,
     axes.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "color": colour, "linewidth": 2})
     x, y = np.subtract(end, start) * 13 / np.hypot(*np.subtract(end, start))
     beside = {"xytext": (x, -y), "textcoords": "offset points"}  # of the tip; these axes have y downwards
-    axes.annotate(name, end, **beside, color=colour, fontsize=11, weight="bold", ha="center", va="center")
+    axes.annotate(name, end, **beside, color=colour, **_name())
+
+
+def _name() -> dict[str, Any]:
+    """How the name of an axis is set: with a white rim, since it lies on any colour."""
+    from matplotlib.patheffects import withStroke
+
+    rim = [withStroke(linewidth=3, foreground="white")]
+    return {"fontsize": 11, "ha": "center", "va": "center", "weight": "bold", "path_effects": rim}

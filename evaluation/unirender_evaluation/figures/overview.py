@@ -7,6 +7,7 @@ each scene, the truth is the last; what a method cannot do stays empty.
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from unirender.intrinsics import Intrinsics
 from unirender.light.resampling import resample_environment
@@ -46,7 +47,7 @@ def overview(subjects: Sequence[Subject], suite: Suite, scenes: Sequence[Scene])
 
 
 def map_tiles(found: Intrinsics | None, mask: Mask) -> list[Tile | None]:
-    """A tile for each of `MAPS` that is there."""
+    """A tile for each of `MAPS` that is there; a roughness or metallic that is one number has it in its corner."""
     tiles: list[Tile | None] = []
     for name in MAPS:
         value = getattr(found, name, None)
@@ -55,5 +56,12 @@ def map_tiles(found: Intrinsics | None, mask: Mask) -> list[Tile | None]:
         elif name == "environment":
             tiles.append(Tile(map_picture(name, resample_environment(value, ENVIRONMENT)).astype(np.float32)))
         else:
-            tiles.append(Tile(over_white(map_picture(name, value), mask)))
+            number = _one_number(value, mask) if name in ("roughness", "metallic") else ""
+            tiles.append(Tile(over_white(map_picture(name, value), mask), number))
     return tiles
+
+
+def _one_number(value: Float[np.ndarray, "h w 1"], mask: Mask) -> str:
+    """What a map is everywhere on the object, to what a PNG can tell; empty where it varies."""
+    inside = value[mask > 0]
+    return f"{inside.mean():.2f}" if np.ptp(inside) < 1 / 255 else ""

@@ -15,7 +15,7 @@ from unirender_evaluation.multiview.scenes import MultiviewScene
 from unirender_evaluation.multiview.scoring import Looks
 from unirender_evaluation.multiview.settings import STANDARD
 from unirender_evaluation.multiview.tables import MULTIVIEW_TABLE, PROTOCOL
-from unirender_evaluation.records import Record
+from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.report.gallery import GalleryItem, Picture, image_picture
 from unirender_evaluation.report.pictures import SCORES, chosen_places, read_sheet, sheet_key, write_sheet
 from unirender_evaluation.suites.suite import Suite
@@ -49,20 +49,20 @@ class MultiviewPictures:
         mask = np.repeat(looks.novel.mask(CAMERA), 3, axis=-1)
         write_sheet(self._path(scene_key, TRUTH), {**camera_pictures(looks, scene), **given, MASK: mask}, TRUTH)
 
-    def items(self, records: Sequence[Record], suite: Suite) -> list[GalleryItem]:
-        """Worst, median and best object by the novel view of the first row with pictures."""
+    def items(self, records: Sequence[Record], suite: Suite, run: RunInfo) -> list[GalleryItem]:
+        """Worst, median and best object by the novel views of the run's first row with pictures."""
         own = [r for r in records if (r.table, r.protocol) == (MULTIVIEW_TABLE.name, PROTOCOL)]
         own = [r for r in own if self._path(r.sample, r.method).is_file() and self._path(r.sample, TRUTH).is_file()]
         if not own:
             return []
         ranked_by, found = metric_key("novel", METRICS["psnr"]), []
-        leader = own[0].method
+        leader = next(info.key for info in run.methods if any(r.method == info.key for r in own))
         ranked = sorted((r.values[ranked_by], r.sample) for r in own if r.method == leader)
         for place, rank in chosen_places(len(ranked)).items():
             score, sample = ranked[place]
             about = {"leader": leader, "rank": rank, "place": place + 1, "count": len(ranked)}
             item = self._item(sample, [r for r in own if r.sample == sample], suite)
-            found.append(GalleryItem(**item, **about, figure=f"PSNR {format_number(score, 1)} dB"))
+            found.append(GalleryItem(**item, **about, figure=f"PSNR of novel views {format_number(score, 1)} dB"))
         return found
 
     def _item(self, sample: str, records: Sequence[Record], suite: Suite) -> dict:
@@ -78,6 +78,7 @@ class MultiviewPictures:
             "question": f"textures and light from {STANDARD.seen} views; relit by {suite.other_light(scene).light}",
             "mask": mask,
             "given": given,
+            "given_mask": np.ones_like(mask),  # whole pictures: other cameras see the object elsewhere
             "truth": truth,
             "predictions": {r.method: read_sheet(self._path(sample, r.method), size) for r in records},
             "scores": {r.method: _scores(r) for r in records},

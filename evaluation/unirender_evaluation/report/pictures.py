@@ -37,6 +37,7 @@ PRIMARY = {  # table -> metric and quantities that rank its samples; a sample ha
     "relighting": ("psnr", ("relit",)),
     LIGHT[0]: ("rmse_relative", (MATTE_BALL,)),
 }
+RANKED_BY = {"inverse": "albedo", "relighting": "relit", LIGHT[0]: "matte ball"}  # its name beside other pictures
 BALLS = {"matte ball": MATTE_BALL, "glossy ball": GLOSSY_BALL}
 BALL_PICTURES = (*BALLS, "mirror ball")
 SCORES = (("psnr", "{:.1f} dB"), ("cosine", "cos {:.3f}"), ("mse", "MSE {:.3f}"), ("rmse_relative", "error {:.2f}"))
@@ -94,7 +95,8 @@ class Pictures:
                     continue
                 about = {"leader": leader, "rank": rank, "place": place + 1, "count": len(ranked)}
                 metric = METRICS[PRIMARY[table][0]]
-                figure = f"{metric.label} {format_number(score, metric.decimals - 1)} {metric.unit}".rstrip()
+                number = f"{metric.label} {format_number(score, metric.decimals - 1)} {metric.unit}"
+                figure = f"{RANKED_BY.get(table, '')} {number}".strip()
                 item = self._item(task, [r for r in asked if r.sample == sample], about | {"figure": figure})
                 found += [] if item is None else [item]
         return found

@@ -141,7 +141,7 @@ def _tile(table: Table, column: Column, i: int) -> dict[str, Any] | None:
 
     def text(row: Row, cell: Estimate) -> str:
         subset = FEW.format(cell.n) if cell.n < full else ""
-        return f"{row.label} {format_number(cell.mean, metric.decimals)}{subset}"
+        return f"{row.label}: {format_number(cell.mean, metric.decimals)}{subset}"
 
     ours = next((found for kind in LEADING if (found := best(kind)) is not None), None)
     if ours is None:

@@ -81,7 +81,7 @@ def report_run(folder: Path, suite: "Suite", run: RunInfo, records: Sequence[Rec
 
     pictures = Pictures(folder / "pictures", suite, scene_ids(suite, run.limit))
     items = pictures.items(records, leading_row(run))
-    items += MultiviewPictures(folder / "pictures").items(records, suite)
+    items += MultiviewPictures(folder / "pictures").items(records, suite, run)
     sheets = make_sheets(pictures.leading(records, leading_row(run)))
     verdict = (folder / VERDICT).read_text(encoding="utf-8") if (folder / VERDICT).is_file() else ""
     return write_report(

@@ -4,12 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from unirender.camera import Camera
+from unirender.color import luminance, srgb_decode
 from unirender_evaluation.figures.command import CONTRACT, KINDS, Figures
 from unirender_evaluation.figures.contract import SAID, ball, camera_figure, maps_figure, png, texel_of
 from unirender_evaluation.suites.suite import Suite
+
+AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 
 
 def test_axes_lie_in_the_light_where_the_contract_has_them() -> None:
@@ -30,6 +34,20 @@ def test_the_ball_fills_the_contracts_share_of_the_height(fov_deg: float) -> Non
     assert normal[100, 100, 2] > 0.999
     assert normal[100, there[100].nonzero()[0][-1], 0] > 0.7, "+x is right"
     assert normal[there[:, 100].nonzero()[0][0], 100, 1] > 0.7, "+y is up"
+
+
+def test_the_names_of_the_axes_are_legible_on_every_colour() -> None:
+    """Contrast (WCAG) of what lies in a name's box: red letters on pink have too little, dark ones on purple, too."""
+    figure = camera_figure(Camera(36.0))
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    shown = luminance(srgb_decode(np.asarray(canvas.buffer_rgba())[..., :3] / np.float32(255)))
+    names = [text for axes in figure.axes for text in axes.texts if text.get_text() in AXES]
+    assert len(names) == 4 + 7, "two above, two on the ball, -z at both ends of the light"
+    for name in names:
+        x0, y0, x1, y1 = np.round(name.get_window_extent().extents).astype(int)
+        box = shown[len(shown) - y1 : len(shown) - y0, x0:x1]
+        assert (box.max() + 0.05) / (box.min() + 0.05) > 4.5, name
 
 
 def test_every_map_has_its_picture(suite: Suite) -> None:

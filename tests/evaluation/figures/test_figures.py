@@ -38,7 +38,7 @@ from unirender_evaluation.figures.grid import (
     save,
 )
 from unirender_evaluation.figures.light import light_figure
-from unirender_evaluation.figures.overview import MAPS, overview
+from unirender_evaluation.figures.overview import MAPS, map_tiles, overview
 from unirender_evaluation.figures.panels import (
     MitsubaTruth,
     Subject,
@@ -236,6 +236,17 @@ def test_the_overview_shows_what_a_method_finds_and_the_truth_below(suite: Suite
     assert [name for name in MAPS if found[name] is not None] == ["albedo"]
     assert found["metallic 1"] is None
     assert all(tile is not None for tile in grid.lines[1].tiles[1:])
+
+
+def test_a_material_that_is_one_number_has_it_in_its_corner() -> None:
+    """Two greys side by side tell nobody 0.30 from 0.35."""
+    mask = np.zeros((4, 4, 1), np.float32)
+    mask[1:3] = 1
+    spread = np.linspace(0, 1, 16, dtype=np.float32).reshape(4, 4, 1)
+    maps = Intrinsics(roughness=0.35 * mask, metallic=spread, diffuse=np.ones((4, 4, 3), np.float32), mask=mask)
+    tiles = dict(zip(MAPS, map_tiles(maps, mask), strict=True))
+    corners = {name: tile.corner for name, tile in tiles.items() if tile is not None}
+    assert corners == {"roughness": "0.35", "metallic": "", "diffuse": ""}
 
 
 def test_the_overview_asks_for_the_suites_edits_and_the_scenes_other_light(suite: Suite) -> None:

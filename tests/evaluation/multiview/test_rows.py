@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 from multiview_pieces import SMALL
 
 from unirender_evaluation.ceiling import ceiling_breaches
+from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.multiview.methods import ConstantObject
 from unirender_evaluation.multiview.pictures import MultiviewPictures
 from unirender_evaluation.multiview.rows import TRIVIAL_USES, multiview_jobs
@@ -103,19 +105,35 @@ def test_a_lost_picture_is_made_again(suite: Suite, rows: list[Row], folder: Pat
 def test_the_report_shows_what_was_found(
     suite: Suite, rows: list[Row], folder: Path, records: list[Record], table: Table
 ) -> None:
-    item = MultiviewPictures(folder).items(records, suite)[0]
+    run = RunInfo("tiny", "0" * 64, 64, (rows[0].info, MethodInfo("noise-ceiling", "Noise ceiling", "ceiling")))
+    item = MultiviewPictures(folder).items(records, suite, run)[0]
     assert (item.rank, item.leader, item.count) == ("worst", "counting", 1)
     assert list(item.truth) == ["novel view", "relit", "albedo", "roughness", "metallic"]
     assert list(item.predictions["counting"]) == list(item.truth)
     assert list(item.given) == ["seen 1", "seen 2"]
+    assert item.given_mask is not None
+    assert item.given_mask.min() == 1, "the mask of the card is another camera's, which would cut them"
     inside = item.mask[..., 0] > 0.99
     assert np.ptp(item.predictions["counting"]["albedo"][inside], axis=0).max() < 0.01, "one colour"
     assert np.ptp(item.truth["novel view"][inside], axis=0).max() > 0.2
     assert item.scores["counting"]["novel view"].endswith(" dB")
-    run = RunInfo("tiny", "0" * 64, 64, (rows[0].info, MethodInfo("noise-ceiling", "Noise ceiling", "ceiling")))
     page = write_report(folder / "report.html", [table], [item], run, records, specs=ALL_TABLES).read_text()
     assert page.count("Multi-view inverse rendering: 8 views, known mesh") >= 2, "table and gallery"
     assert 'class="dot k-optimisation"' in page
+
+
+def test_the_gallery_is_ranked_by_the_first_row_of_the_run_not_of_the_alphabet(
+    suite: Suite, rows: list[Row], folder: Path, records: list[Record], tmp_path: Path
+) -> None:
+    for path in folder.glob("multi-view-*.png"):
+        shutil.copy(path, tmp_path)
+        shutil.copy(path, tmp_path / path.name.replace("counting", "a-trivial-one"))
+    trivial = [dataclasses.replace(r, method="a-trivial-one") for r in records if r.method == "counting"]
+    run = RunInfo("tiny", "0" * 64, 64, (rows[0].info, MethodInfo("a-trivial-one", "Trivial", "trivial")))
+    (item,) = MultiviewPictures(tmp_path).items([*trivial, *records], suite, run)
+    assert (set(item.predictions), item.leader) == ({"a-trivial-one", "counting"}, "counting")
+    (score,) = (r.values[metric_key("novel", "psnr")] for r in records if r.method == "counting")
+    assert item.figure == f"PSNR of novel views {score:.1f} dB", "of all held-out cameras; a picture's own is below it"
 
 
 def test_keys_follow_settings_and_the_parts_that_a_row_uses(suite: Suite, rows: list[Row], folder: Path) -> None:

@@ -13,7 +13,8 @@ from unirender_reference.optimize.exposure import lit
 from unirender_reference.optimize.files.state import open_run
 from unirender_reference.optimize.multiview.result import stage_records, write_result
 from unirender_reference.optimize.refine.watch import GAIN_DB
-from unirender_reference.optimize.show.strips import MOST_LETTERS, short_names, views_strip
+from unirender_reference.optimize.show.strips import LEAST_SIDE, MOST_LETTERS, short_names, views_strip
+from unirender_reference.optimize.views import Views
 
 
 def line(stage: str, iteration: int, seconds: float, held_out: float | None = None) -> dict:
@@ -73,6 +74,14 @@ def test_pictures_go_by_their_names():
     (shown,) = short_names(["a/photograph-of-the-chair-0017.png"])
     assert shown == "…of-the-chair-0017"
     assert len(shown) == MOST_LETTERS
+
+
+@pytest.mark.parametrize("side", [LEAST_SIDE // 2 + 1, LEAST_SIDE - 1, LEAST_SIDE])
+def test_pictures_of_a_strip_are_never_smaller_than_can_be_seen(side: int):
+    image, mask = np.zeros((side, side, 3), np.float32), np.ones((side, side, 1), np.float32)
+    one = dataclasses.replace(painted_views().seen[0], image=image, mask=mask)
+    sheet = views_strip(Views((one,)), np.zeros((1, side, side, 4), np.float32))
+    assert min(sheet.height // 2, sheet.width) > LEAST_SIDE
 
 
 def test_names_stand_above_the_pictures():

@@ -35,7 +35,7 @@ def views_strip(views: Views, found: Float[np.ndarray, "n h w 4"]) -> Image.Imag
     """
     every = (*views.seen, *views.held_out)
     chosen = sorted({round(k) for k in np.linspace(0, len(every) - 1, min(SHOWN_VIEWS, len(every)))})
-    times = max(1, LEAST_SIDE // max(views.height, views.width))
+    times = -(-LEAST_SIDE // max(views.height, views.width))
     given = [_enlarged(_over(views.linear(every[k]), every[k].mask), times) for k in chosen]
     rendered = [_enlarged(_over(found[k][..., :3], found[k][..., 3:]), times) for k in chosen]
     names = short_names([view.name for view in every])
