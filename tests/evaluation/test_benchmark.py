@@ -38,7 +38,7 @@ from unirender_evaluation.runs.dry_run import planned
 from unirender_evaluation.runs.workers import Run, run_in_workers
 from unirender_evaluation.store import KEPT, KEY_PREFIX, Job, Store, content_key
 from unirender_evaluation.subsets import Subsets
-from unirender_evaluation.suites.suite import Scene, Suite
+from unirender_evaluation.suites.suite import Scene, Suite, load_suite
 from unirender_evaluation.tables.protocol import doubts, mask_source
 from unirender_evaluation.task import PROTOCOLS
 from unirender_evaluation.tasks import tasks
@@ -499,6 +499,31 @@ def test_export_writes_inputs_and_no_truth(suite: Suite, tmp_path: Path) -> None
             assert {"table", "protocol"} <= set(question)
             given = meta.parent / answer / "given.exr"
             assert given.exists() == (question["protocol"] in ("given", "given-light", "from-image-sd"))
+
+
+def test_neither_names_nor_times_of_the_export_tell_what_a_picture_shows(suite: Suite, tmp_path: Path) -> None:
+    export_inputs(suite, tmp_path)
+    folders = sorted(tmp_path.iterdir())
+    assert all(re.fullmatch("[0-9a-f]{12}", folder.name) for folder in folders)
+    times = [(folder / "meta.json").stat().st_mtime_ns for folder in folders]
+    assert times == sorted(times)
+    texts = [str(json.loads((folder / "meta.json").read_text())["answers"]) for folder in folders]
+    assert not any(scene.object in text for scene in suite.scenes for text in texts)
+
+
+def test_a_picture_to_decompose_has_no_other_question_in_its_folder() -> None:
+    """Else true maps, or an edit of the base material, would lie beside the picture whose maps are asked for."""
+    suite = load_suite("tiny")
+    asked: dict[str, set[tuple[str, str]]] = {}
+    shown: set[str] = set()
+    for question in PROTOCOLS:
+        for task in tasks(suite, *question, list(suite.scenes)):
+            asked.setdefault(task.folder, set()).add(question)
+            if question == ("rendering", "given"):
+                shown.add(task.sample)
+    inverse = list(tasks(suite, "inverse", "single-image", list(suite.scenes)))
+    assert any(task.sample in shown for task in inverse), "one of them is a picture of maps that are given"
+    assert all(asked[task.folder] == {("inverse", "single-image")} for task in inverse)
 
 
 def test_limited_rows_run_on_their_subset(suite: Suite, tmp_path: Path) -> None:

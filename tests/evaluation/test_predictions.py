@@ -21,7 +21,7 @@ from unirender.exr import image_channels, intrinsics_channels, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender_evaluation import engine
 from unirender_evaluation.export import export_inputs
-from unirender_evaluation.predictions.check import PredictionError, check_predictions
+from unirender_evaluation.predictions.check import PredictionError, check_predictions, questions
 from unirender_evaluation.predictions.conventions import Conventions, read_conventions
 from unirender_evaluation.predictions.png import read_png
 from unirender_evaluation.rows import make_row, prediction_rows
@@ -200,7 +200,7 @@ def test_every_problem_is_listed_at_once(suite: Suite, tmp_path: Path) -> None:
     Image.fromarray(np.zeros((32, 32), np.uint8)).save(maps / "roughnes.png")
     Image.fromarray(np.zeros((32, 32, 3), np.uint8)).save(renders / "render_given.png")
     Image.fromarray(np.zeros((32, 32, 3), np.uint8)).save(folder / "stray.png")
-    (folder / "no_such_picture").mkdir()
+    (folder / "ball-0_l0_m050_r050").mkdir()
     (folder / "conventions.toml").write_text(
         'roughness = "squared"\nnormals = "opencv"\nnormal_axes = ["x", "y", "y"]\n'
     )
@@ -218,7 +218,8 @@ def test_every_problem_is_listed_at_once(suite: Suite, tmp_path: Path) -> None:
         "roughnes.png: answers no question about this picture",
         "render_given is there as EXR and as PNG",
         "stray.png: lies outside the pictures' folders",
-        "no_such_picture: the suite 'ball' has no such picture, expected names like ball-0_l0",
+        "ball-0_l0_m050_r050: the suite 'ball' has no such picture, expected the folders' names of `unirender bench "
+        f"export`, like {min(questions(suite))}",
         f"{other / given.folder / 'render_given.exr'}: not a readable OpenEXR file",
     ):
         assert sum(expected in problem for problem in error.value.problems) == 1, (expected, error.value.problems)
@@ -576,7 +577,7 @@ def test_files_in_an_answers_folder_are_problems(suite: Suite, tmp_path: Path) -
     assert len(problems) == 8, problems
     assert any(problem.startswith(f"{pipe}: a pipe, a socket or a device, expected a file; ") for problem in problems)
     assert f"{loop}: a link to {loop.name}, which is not there; copy the file, or remove the link" in problems
-    expected = f"the suite {suite.spec.name!r} has no such picture, expected names like {task.folder}"
+    expected = f"the suite {suite.spec.name!r} has no such picture, expected {task.folder}"
     assert f"{twin}: {expected}; {task.folder} is there, too: keep one of them" in problems
     twin.rmdir()
     twin.symlink_to(task.folder)  # as on a file system without case, where it is that folder

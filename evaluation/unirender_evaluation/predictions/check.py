@@ -159,12 +159,15 @@ def _unknown_picture(path: Path, asked: dict[str, Question], suite: str) -> str:
             "it files like albedo.png; a script in the documentation sorts them (docs/your_files.md, Files of other "
             "methods)"
         )
-    twins = [name for name in asked if name.casefold() == path.name.casefold()]
-    close = twins or difflib.get_close_matches(path.name, asked, 1) or sorted(asked)[:1]
-    there = path.with_name(close[0])  # on a file system without case it may be this very folder
-    other = bool(twins) and there.is_dir() and not there.samefile(path)
-    both = f"; {close[0]} is there, too: keep one of them" if other else ""
-    return f"{path}: the suite {suite!r} has no such picture, expected names like {close[0]}{both}"
+    twin = next((name for name in asked if name.casefold() == path.name.casefold()), None)
+    if twin is None:
+        return (
+            f"{path}: the suite {suite!r} has no such picture, expected the folders' names of `unirender bench "
+            f"export`, like {min(asked)}"
+        )
+    there = path.with_name(twin)  # on a file system without case it may be this very folder
+    both = f"; {twin} is there, too: keep one of them" if there.is_dir() and not there.samefile(path) else ""
+    return f"{path}: the suite {suite!r} has no such picture, expected {twin}{both}"
 
 
 def _visible(folder: Path) -> Iterator[Path]:
