@@ -28,16 +28,17 @@ FEW = 20  # objects or lights: a claim that is not shown of fewer is open, of as
 @dataclass(frozen=True)
 class Finding:
     """A claim with its comparison: None where a row has no such value. `holds` is None for a distance that is only
-    stated, and where nothing was compared, for the reason `why`. `asked`: on how many samples any row
-    has this number, since a row may answer the easy ones alone. `p_value`: of the difference, for Holm's correction.
-    `over_lights`: the difference again, with its interval over objects and lights; None where the lights of the
-    samples, of which there are `lights`, are not known."""
+    stated, and where nothing was compared, for the reason `why`. `asked`: on how many samples any row has this number,
+    since a row may answer the easy ones alone; `in_part`: it did, and shows nothing by it. `p_value`: of the
+    difference, for Holm's correction. `over_lights`: the difference again, with its interval over objects and lights;
+    None where the lights of the samples, of which there are `lights`, are not known."""
 
     claim: Claim
     comparison: Comparison | None
     holds: bool | None
     why: str = "not run "
     asked: int = 0
+    in_part: bool = False
     p_value: float = 1.0
     over_lights: Estimate | None = None
     lights: int = 0
@@ -49,9 +50,11 @@ class Finding:
 
     @property
     def is_open(self) -> bool:
-        """Whether it does not hold, nor its opposite, on fewer than `FEW` objects: more of them may decide it."""
+        """Whether it does not hold, nor its opposite, on fewer than `FEW` objects, or on a part of the questions: more
+        of them may decide it."""
         found = self.comparison
-        return self.holds is False and found is not None and not found.b_beats_a and found.difference.clusters < FEW
+        few = self.in_part or (found is not None and found.difference.clusters < FEW)
+        return self.holds is False and found is not None and not found.b_beats_a and few
 
     @property
     def other_lights(self) -> str:
@@ -66,7 +69,7 @@ class Finding:
             return "stated"
         above, below = (found.low > 0, found.high < 0) if not compared.equal else (False, False)
         if (above, below)[not self.claim.kind.higher_is_better]:
-            return "holds"
+            return "open" if self.in_part else "holds"
         return "open" if not (above or below) and min(found.clusters, self.lights) < FEW else "fails"
 
     @property
@@ -129,7 +132,9 @@ def findings(
             claimed = claim.expected == "beats"
             asked = len({record.sample for record in whole if key in record.values})
             p = paired_p_value(a, without_rounding(a, b), {record.sample: record.object for record in chosen})
-            finding = Finding(claim, comparison, comparison.a_beats_b if claimed else None, asked=asked, p_value=p)
+            in_part = claim.in_full and len(values_of(whole, claim.a, key)) < asked
+            holds = comparison.a_beats_b and not in_part if claimed else None
+            finding = Finding(claim, comparison, holds, asked=asked, in_part=in_part, p_value=p)
             if lights:
                 other = difference_over_lights(chosen, key, claim.a, claim.b, lights)
                 finding = replace(finding, over_lights=other, lights=light_count([lights[s] for s in common]))
