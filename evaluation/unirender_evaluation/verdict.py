@@ -3,7 +3,7 @@
 import functools
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from unirender_evaluation.ceiling import ceiling_lines
@@ -19,6 +19,7 @@ from unirender_evaluation.comparisons import (
 )
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.statistics import Estimate, holm, light_count, paired_p_value
+from unirender_evaluation.tables.mistakes import truth_said
 from unirender_evaluation.task import LIGHT
 
 ORDER = ("FAILS", "open", "HOLDS", "stated")
@@ -173,6 +174,7 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, li
     lines += [f"  {line}" for line in _counts_line(found)]
     lines += [f"  {finding}" for finding in sorted(found, key=_place)]
     lines += [f"  ({line})" for line in summary(found)]
+    lines += [f"  FAILS  {method}: {said}" for method, said in _told(records)]
     lines += ceiling_lines(records)
     told = "what its check found stands in the run's verdict.txt"
     unknown = f"not rendered again ({run.unchecked})" if run.unchecked else told
@@ -180,6 +182,14 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, li
     if run.limit is not None:
         lines.append(f"  (--limit {run.limit}: a partial run, not a result)")
     return "\n".join(lines)
+
+
+def _told(records: Sequence[Record]) -> Iterator[tuple[str, str]]:
+    """Rows whose maps or lights are the truth but for rounding, with what is said of them."""
+    by_method: dict[str, list[Record]] = {}
+    for record in records:
+        by_method.setdefault(record.method, []).append(record)
+    return ((method, said) for method, own in sorted(by_method.items()) if (said := truth_said(own)))
 
 
 def _place(finding: Finding) -> int:
