@@ -49,18 +49,23 @@ def _bounded(records: Sequence[Record]) -> list[tuple[str, str]]:
 def _margins(records: Sequence[Record], table: str, protocol: str) -> Iterator[Margin]:
     """Of every row on every PSNR that it shares with the ceiling."""
     chosen = Selection(table, protocol).of(records)
+    for key in sorted({key for r in chosen if r.method == CEILING for key in r.values if ".psnr" in key}):
+        yield from margins_of(chosen, key)
+
+
+def margins_of(chosen: Sequence[Record], key: str) -> Iterator[Margin]:
+    """Of every row on one PSNR; `chosen` is one `Selection`."""
     clusters = {r.sample: r.object for r in chosen}
-    bound = [r for r in chosen if r.method == CEILING]
-    for key in sorted({key for r in bound for key in r.values if ".psnr" in key}):
-        limit = {r.sample: r.values[key] for r in bound if math.isfinite(r.values.get(key, math.inf))}
-        for method in sorted({r.method for r in chosen} - {CEILING}):
-            rows = (r for r in chosen if r.method == method and key in r.values and r.sample in limit)
-            values = {r.sample: r.values[key] for r in rows}
-            if not values:
-                continue  # no sample in common: the row was not asked, or no truth here has noise
-            infinite = math.inf in values.values()
-            low = math.inf if infinite else paired_difference(values, limit, clusters).low
-            yield Margin(table, protocol, key, method, low)
+    bound = (r for r in chosen if r.method == CEILING)
+    limit = {r.sample: r.values[key] for r in bound if math.isfinite(r.values.get(key, math.inf))}
+    for method in sorted({r.method for r in chosen} - {CEILING}):
+        rows = [r for r in chosen if r.method == method and key in r.values and r.sample in limit]
+        values = {r.sample: r.values[key] for r in rows}
+        if not values:
+            continue  # no sample in common: the row was not asked, or no truth here has noise
+        infinite = math.inf in values.values()
+        low = math.inf if infinite else paired_difference(values, limit, clusters).low
+        yield Margin(rows[0].table, rows[0].protocol, key, method, low)
 
 
 def ceiling_lines(records: Sequence[Record]) -> list[str]:

@@ -38,7 +38,8 @@ class MaskedNumber:
 @dataclass(frozen=True)
 class Claim(MaskedNumber):
     """`a` against `b` on one number. `expected`: "beats" is a claim, "stated" only states the distance. `remark`: what
-    a reader must know beside the figure. `scale`: how the number is aligned, where its metric has such variants."""
+    a reader must know beside the figure. `scale`: how the number is aligned, where its metric has such variants.
+    `in_full`: it can hold only where `a` answers every sample: a stranger chooses which."""
 
     table: str
     protocol: str
@@ -49,6 +50,7 @@ class Claim(MaskedNumber):
     expected: str = "beats"
     remark: str = ""
     scale: Scale = "raw"
+    in_full: bool = False
 
 
 OPTIMISED, REFINED = "nvdiffrec-mitsuba", "ours-mitsuba-refinement"
@@ -185,7 +187,8 @@ def stranger_claims(row: str) -> tuple[Claim, ...]:
     """What is asked of somebody else's row: to beat every trivial row; its distance to closed forms and ceiling."""
     relighting = (claim for protocol in LIT for claim in relight_claims(row, protocol))
     maps = (*inverse_claims(row), *light_claims(row))
-    return (*edit_claims(row), *given_claims(row), *maps, *relighting, *ceiling_claims(row))
+    asked = (*edit_claims(row), *given_claims(row), *maps, *relighting, *ceiling_claims(row))
+    return tuple(replace(claim, in_full=True) for claim in asked)
 
 
 def run_claims(records: Sequence[Record], run: RunInfo) -> list[Claim]:

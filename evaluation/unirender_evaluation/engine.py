@@ -33,7 +33,7 @@ class Prediction:
 
     image: Image | None = None
     maps: Intrinsics | None = None
-    seconds: float = 0.0
+    seconds: float | None = None  # None: not measured
 
 
 class NoAnswer(UnirenderError):
@@ -58,7 +58,7 @@ def answer(row: Row, task: Task) -> Prediction:
     start = time.perf_counter()
     if row.predictions is not None:
         image, maps = row.predictions.answer(task)
-        return Prediction(image, maps, 0.0)
+        return Prediction(image, maps)
     image = maps = None
     earlier = 0.0
     for capability in task.asks:
@@ -243,10 +243,11 @@ def method_jobs(
 ) -> Iterator[Job]:
     """Every question about one scene to every row that answers it; row innermost, so that rows share decompositions.
 
+    In the order of their neutral names: by that of the suite, a method that counts its calls would know the material.
     `scenes` are those of the whole run: rows on a subset choose from them.
     """
     for table, protocol in PROTOCOLS:
-        for task in tasks(suite, table, protocol, [scene]):
+        for task in sorted(tasks(suite, table, protocol, [scene]), key=lambda task: task.folder):
             for row in rows:
                 if row.answers(task, scenes):
                     key = content_key(suite, scene, task.identity, row.config, versions.of(row.scored_with))

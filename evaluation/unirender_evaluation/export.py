@@ -9,7 +9,8 @@
     <picture>/<answer>/environment.exr   the light given with it: R, G, B, linear, float32, lat-long in camera axes
 
 A picture that no method may see (its true maps are given instead) has no `image.png` and no `mask.exr`. No truth is
-written but what its protocol gives away.
+written but what its protocol gives away: folders have neutral names and are written in the order of these, so that
+neither names nor times say which object or material a picture is of.
 """
 
 import json
@@ -27,22 +28,21 @@ from unirender_evaluation.tasks import scene_ids, tasks
 
 def export_inputs(suite: Suite, out: Path, limit: int | None = None) -> int:
     """Writes the inputs of all protocols (see the module); returns the number of questions."""
-    asked: dict[str, dict[str, Any]] = {}
-    count = 0
+    asked: dict[str, list[Task]] = {}
     for table, protocol in PROTOCOLS:
         for task in tasks(suite, table, protocol, scene_ids(suite, limit)):
-            folder = out / task.folder
-            folder.mkdir(parents=True, exist_ok=True)
-            asked.setdefault(task.folder, {})[task.answer] = _write_question(task, folder)
-            count += 1
-    for name, questions in asked.items():
+            asked.setdefault(task.folder, []).append(task)
+    count = sum(map(len, asked.values()))
+    for name in sorted(asked):
+        folder = out / name
+        folder.mkdir(parents=True)
         meta = {
             "suite": suite.spec.name,
             "suite_sha256": suite.sha256,
             "fov_deg": suite.spec.fov_deg,
-            "answers": questions,
+            "answers": {task.answer: _write_question(task, folder) for task in asked.pop(name)},
         }
-        (out / name / "meta.json").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
+        (folder / "meta.json").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
     return count
 
 

@@ -12,6 +12,10 @@
 
 A picture is what a camera would store: 8-bit sRGB. No other truth reaches a method; the mask and the camera are inputs
 everywhere. A row that is told more declares it (`rows.Row.told`).
+
+The folder of an answer has a neutral name (`Suite.neutral_name`), which says neither the object nor the material. The
+pictures that are edited and relit, those to be decomposed and the maps to be rendered have folders of their own: else
+true maps, or an edit of a known material, would lie beside the same picture to be decomposed.
 """
 
 from collections.abc import Iterable, Iterator
@@ -95,6 +99,11 @@ def tasks(suite: Suite, table: str, protocol: str, scenes: Iterable[Scene]) -> I
         yield from makers[table, protocol](suite, scene, protocol)
 
 
+def _edited_folder(suite: Suite, scene: Scene) -> str:
+    """Of the picture with the base material, which is edited and relit, and whose light is asked for."""
+    return suite.neutral_name(f"edit/{scene.key}")
+
+
 def _edits(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
     """Questions for the picture with another material."""
     base = suite.spec.base
@@ -105,7 +114,7 @@ def _edits(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
             sample=f"{scene.key}_{material_key(target)}",
             scene=scene,
             asks=("edit",),
-            folder=f"{scene.key}_{material_key(base)}",
+            folder=_edited_folder(suite, scene),
             answer=f"edit_{material_key(target)}",
             read=partial(_read_edit, suite, scene, target),
             geometry=partial(known_mesh, suite, scene),
@@ -132,7 +141,7 @@ def _renders(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
             sample=f"{scene.key}_{material_key(target)}",
             scene=scene,
             asks=("render",),
-            folder=f"{scene.key}_{material_key(target)}",
+            folder=suite.neutral_name(f"render/{scene.key}_{material_key(target)}"),
             answer=f"render_{protocol}",
             read=partial(_read_render, suite, scene, target, protocol),
             quantity=edit_quantity(suite.spec.base, target),
@@ -159,7 +168,7 @@ def _inverse(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
             sample=sample,
             scene=scene,
             asks=("decompose",),
-            folder=sample,
+            folder=suite.neutral_name(f"decompose/{sample}"),
             answer="intrinsics",
             read=partial(_read_inverse, suite, scene, material),
             geometry=partial(known_mesh, suite, scene),
@@ -185,7 +194,7 @@ def _relights(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
         sample=f"{scene.key}_to_{light}",
         scene=scene,
         asks=("relight", "decompose") if given_sd else ("relight",),
-        folder=f"{scene.key}_{material_key(suite.spec.base)}",
+        folder=_edited_folder(suite, scene),
         answer=f"relight_{light}_{'sd' if given_sd else 'hdri'}",
         read=partial(_read_relight, suite, scene, target, given_sd),
         geometry=partial(known_mesh, suite, scene),
@@ -220,7 +229,7 @@ def _light(suite: Suite, scene: Scene, protocol: str) -> Iterator[Task]:
         sample=sample,
         scene=scene,
         asks=("decompose",),
-        folder=sample,
+        folder=_edited_folder(suite, scene),
         answer=LIGHT_ANSWER,
         read=partial(_read_light, suite, scene),
         geometry=partial(known_mesh, suite, scene),

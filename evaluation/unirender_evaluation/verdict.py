@@ -3,7 +3,7 @@
 import functools
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from unirender_evaluation.ceiling import ceiling_lines
@@ -19,6 +19,7 @@ from unirender_evaluation.comparisons import (
 )
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.statistics import Estimate, holm, light_count, paired_p_value
+from unirender_evaluation.tables.mistakes import truth_said
 from unirender_evaluation.task import LIGHT
 
 ORDER = ("FAILS", "open", "HOLDS", "stated")
@@ -28,16 +29,17 @@ FEW = 20  # objects or lights: a claim that is not shown of fewer is open, of as
 @dataclass(frozen=True)
 class Finding:
     """A claim with its comparison: None where a row has no such value. `holds` is None for a distance that is only
-    stated, and where nothing was compared, for the reason `why`. `asked`: on how many samples any row
-    has this number, since a row may answer the easy ones alone. `p_value`: of the difference, for Holm's correction.
-    `over_lights`: the difference again, with its interval over objects and lights; None where the lights of the
-    samples, of which there are `lights`, are not known."""
+    stated, and where nothing was compared, for the reason `why`. `asked`: on how many samples any row has this number,
+    since a row may answer the easy ones alone; `in_part`: it did, and shows nothing by it. `p_value`: of the
+    difference, for Holm's correction. `over_lights`: the difference again, with its interval over objects and lights;
+    None where the lights of the samples, of which there are `lights`, are not known."""
 
     claim: Claim
     comparison: Comparison | None
     holds: bool | None
     why: str = "not run "
     asked: int = 0
+    in_part: bool = False
     p_value: float = 1.0
     over_lights: Estimate | None = None
     lights: int = 0
@@ -49,9 +51,11 @@ class Finding:
 
     @property
     def is_open(self) -> bool:
-        """Whether it does not hold, nor its opposite, on fewer than `FEW` objects: more of them may decide it."""
+        """Whether it does not hold, nor its opposite, on fewer than `FEW` objects, or on a part of the questions: more
+        of them may decide it."""
         found = self.comparison
-        return self.holds is False and found is not None and not found.b_beats_a and found.difference.clusters < FEW
+        few = self.in_part or (found is not None and found.difference.clusters < FEW)
+        return self.holds is False and found is not None and not found.b_beats_a and few
 
     @property
     def other_lights(self) -> str:
@@ -66,7 +70,7 @@ class Finding:
             return "stated"
         above, below = (found.low > 0, found.high < 0) if not compared.equal else (False, False)
         if (above, below)[not self.claim.kind.higher_is_better]:
-            return "holds"
+            return "open" if self.in_part else "holds"
         return "open" if not (above or below) and min(found.clusters, self.lights) < FEW else "fails"
 
     @property
@@ -129,7 +133,9 @@ def findings(
             claimed = claim.expected == "beats"
             asked = len({record.sample for record in whole if key in record.values})
             p = paired_p_value(a, without_rounding(a, b), {record.sample: record.object for record in chosen})
-            finding = Finding(claim, comparison, comparison.a_beats_b if claimed else None, asked=asked, p_value=p)
+            in_part = claim.in_full and len(values_of(whole, claim.a, key)) < asked
+            holds = comparison.a_beats_b and not in_part if claimed else None
+            finding = Finding(claim, comparison, holds, asked=asked, in_part=in_part, p_value=p)
             if lights:
                 other = difference_over_lights(chosen, key, claim.a, claim.b, lights)
                 finding = replace(finding, over_lights=other, lights=light_count([lights[s] for s in common]))
@@ -168,6 +174,7 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, li
     lines += [f"  {line}" for line in _counts_line(found)]
     lines += [f"  {finding}" for finding in sorted(found, key=_place)]
     lines += [f"  ({line})" for line in summary(found)]
+    lines += [f"  FAILS  {method}: {said}" for method, said in _told(records)]
     lines += ceiling_lines(records)
     told = "what its check found stands in the run's verdict.txt"
     unknown = f"not rendered again ({run.unchecked})" if run.unchecked else told
@@ -175,6 +182,14 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, li
     if run.limit is not None:
         lines.append(f"  (--limit {run.limit}: a partial run, not a result)")
     return "\n".join(lines)
+
+
+def _told(records: Sequence[Record]) -> Iterator[tuple[str, str]]:
+    """Rows whose maps or lights are the truth but for rounding, with what is said of them."""
+    by_method: dict[str, list[Record]] = {}
+    for record in records:
+        by_method.setdefault(record.method, []).append(record)
+    return ((method, said) for method, own in sorted(by_method.items()) if (said := truth_said(own)))
 
 
 def _place(finding: Finding) -> int:

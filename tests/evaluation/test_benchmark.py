@@ -38,9 +38,9 @@ from unirender_evaluation.runs.dry_run import planned
 from unirender_evaluation.runs.workers import Run, run_in_workers
 from unirender_evaluation.store import KEPT, KEY_PREFIX, Job, Store, content_key
 from unirender_evaluation.subsets import Subsets
-from unirender_evaluation.suites.suite import Scene, Suite
+from unirender_evaluation.suites.suite import Scene, Suite, load_suite
 from unirender_evaluation.tables.protocol import doubts, mask_source
-from unirender_evaluation.task import PROTOCOLS
+from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import tasks
 from unirender_evaluation.versions import LPIPS, MODEL, REFERENCE, Versions
 
@@ -486,6 +486,7 @@ def test_folder_and_plugin_score_alike(suite: Suite, tmp_path: Path) -> None:
     read = evaluate(suite, prediction_rows({"guess": folder}), tmp_path / "read.jsonl", scenes)
     pick = lambda records: {(r.table, r.protocol, r.sample): dict(r.values) for r in records if r.method == "guess"}  # noqa: E731 - one use
     assert pick(called) == pick(read)
+    assert all(r.seconds is None for r in read if r.method == "guess"), "reading files is no measurement of a method"
     assert len(pick(read)) == sum(1 for t, p in PROTOCOLS for _ in tasks(suite, t, p, scenes))
 
 
@@ -499,6 +500,52 @@ def test_export_writes_inputs_and_no_truth(suite: Suite, tmp_path: Path) -> None
             assert {"table", "protocol"} <= set(question)
             given = meta.parent / answer / "given.exr"
             assert given.exists() == (question["protocol"] in ("given", "given-light", "from-image-sd"))
+
+
+def test_neither_names_nor_times_of_the_export_tell_what_a_picture_shows(suite: Suite, tmp_path: Path) -> None:
+    export_inputs(suite, tmp_path)
+    folders = sorted(tmp_path.iterdir())
+    assert all(re.fullmatch("[0-9a-f]{12}", folder.name) for folder in folders)
+    times = [(folder / "meta.json").stat().st_mtime_ns for folder in folders]
+    assert times == sorted(times)
+    texts = [str(json.loads((folder / "meta.json").read_text())["answers"]) for folder in folders]
+    assert not any(scene.object in text for scene in suite.scenes for text in texts)
+
+
+def test_a_picture_to_decompose_has_no_other_question_in_its_folder() -> None:
+    """Else true maps, or an edit of the base material, would lie beside the picture whose maps are asked for."""
+    suite = load_suite("tiny")
+    asked: dict[str, set[tuple[str, str]]] = {}
+    shown: set[str] = set()
+    for question in PROTOCOLS:
+        for task in tasks(suite, *question, list(suite.scenes)):
+            asked.setdefault(task.folder, set()).add(question)
+            if question == ("rendering", "given"):
+                shown.add(task.sample)
+    inverse = list(tasks(suite, "inverse", "single-image", list(suite.scenes)))
+    assert any(task.sample in shown for task in inverse), "one of them is a picture of maps that are given"
+    assert all(asked[task.folder] == {("inverse", "single-image")} for task in inverse)
+
+
+def test_the_order_of_the_questions_does_not_tell_the_material() -> None:
+    """That of the suite ascends in metallic: with five pictures a scene its place alone has a mean squared error of
+    0.006."""
+    suite, order = load_suite("tiny"), list[str]()
+
+    class Seen:
+        def has(self, task: Task, method: str, key: str) -> bool:
+            if task.table == "inverse":
+                order.append(task.sample.removeprefix(task.scene.key))
+            return True
+
+        def keep(self, task: Task, method: str, key: str, prediction: Prediction) -> None: ...
+
+    rows, versions = [make_row(Guess(), "external")], Versions("core", {LPIPS: "none", MODEL: "none"})
+    for scene in suite.scenes:
+        list(method_jobs(suite, rows, list(suite.scenes), scene, versions, (), Seen()))
+    places = np.argsort(np.array(order).reshape(-1, 5), axis=1)
+    assert len(places) == len(suite.scenes)
+    assert np.abs(places.mean(axis=0) - 2).max() < 1, "no place is that of the lower or of the higher values"
 
 
 def test_limited_rows_run_on_their_subset(suite: Suite, tmp_path: Path) -> None:

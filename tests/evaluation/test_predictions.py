@@ -200,7 +200,7 @@ def test_every_problem_is_listed_at_once(suite: Suite, tmp_path: Path) -> None:
     Image.fromarray(np.zeros((32, 32), np.uint8)).save(maps / "roughnes.png")
     Image.fromarray(np.zeros((32, 32, 3), np.uint8)).save(renders / "render_given.png")
     Image.fromarray(np.zeros((32, 32, 3), np.uint8)).save(folder / "stray.png")
-    (folder / "no_such_picture").mkdir()
+    (folder / "ball-0_l0_m050_r050").mkdir()
     (folder / "conventions.toml").write_text(
         'roughness = "squared"\nnormals = "opencv"\nnormal_axes = ["x", "y", "y"]\n'
     )
@@ -218,7 +218,8 @@ def test_every_problem_is_listed_at_once(suite: Suite, tmp_path: Path) -> None:
         "roughnes.png: answers no question about this picture",
         "render_given is there as EXR and as PNG",
         "stray.png: lies outside the pictures' folders",
-        "no_such_picture: the suite 'ball' has no such picture, expected names like ball-0_l0",
+        "ball-0_l0_m050_r050: the suite 'ball' has no such picture, expected the folders' names of `unirender bench "
+        "export`, like ",
         f"{other / given.folder / 'render_given.exr'}: not a readable OpenEXR file",
     ):
         assert sum(expected in problem for problem in error.value.problems) == 1, (expected, error.value.problems)
@@ -542,6 +543,16 @@ def test_what_is_wrong_with_all_pictures_is_said_three_times(suite: Suite, tmp_p
     assert lines == [*caught.value.problems[:3], more, caught.value.problems[-1]]
 
 
+def test_folders_under_names_of_before_are_said_three_times(suite: Suite, tmp_path: Path) -> None:
+    for number in range(5):
+        (tmp_path / f"ball-{number}_l0_m050_r050").mkdir()
+    with pytest.raises(PredictionError) as caught:
+        check_predictions(prediction_rows({"mine": tmp_path}), suite)
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 5
+    assert lines[-1] == "... and 2 more like this, of other pictures"
+
+
 def test_another_methods_folder_and_an_archive_are_named_as_such(suite: Suite, tmp_path: Path) -> None:
     answer_all(suite, tmp_path / "all" / "other")
     (problem,) = problems_of(suite, tmp_path / "all")
@@ -576,7 +587,8 @@ def test_files_in_an_answers_folder_are_problems(suite: Suite, tmp_path: Path) -
     assert len(problems) == 8, problems
     assert any(problem.startswith(f"{pipe}: a pipe, a socket or a device, expected a file; ") for problem in problems)
     assert f"{loop}: a link to {loop.name}, which is not there; copy the file, or remove the link" in problems
-    expected = f"the suite {suite.spec.name!r} has no such picture, expected names like {task.folder}"
+    expected = f"the suite {suite.spec.name!r} has no such picture, expected the folders' names of"
+    expected += f" `unirender bench export`, like {task.folder}"
     assert f"{twin}: {expected}; {task.folder} is there, too: keep one of them" in problems
     twin.rmdir()
     twin.symlink_to(task.folder)  # as on a file system without case, where it is that folder

@@ -25,9 +25,10 @@ from unirender_evaluation.tasks import tasks
 def test_missing_answers_are_counted_and_listed(tmp_path: Path) -> None:
     suite = make_suite(tmp_path / "suite", objects=1)
     scene = suite.scenes[0]
-    folder = tmp_path / "mine" / f"{scene.key}_m050_r050"
+    edit = next(tasks(suite, "rendering", "from-image", [scene]))
+    folder = tmp_path / "mine" / edit.folder
     folder.mkdir(parents=True)
-    for name in ("edit_m100_r050.png", "environment.exr"):
+    for name in (f"{edit.answer}.png", "environment.exr"):
         (folder / name).write_bytes(b"")  # whether one is there, not what is in it
     rows = [make_row(UneditedInput(), "trivial"), *prediction_rows({"mine": tmp_path / "mine"})]
     missing = missing_answers(suite, rows, [scene])
@@ -40,7 +41,9 @@ def test_missing_answers_are_counted_and_listed(tmp_path: Path) -> None:
     assert said == [f"mine: has files for 2 of {asked} questions; the others: {tmp_path / 'missing.txt'}"]
     lines = (tmp_path / "missing.txt").read_text().splitlines()
     assert lines == [f"mine: {question}" for question in questions]
-    assert not any("m100_r050" in line for line in lines if line.startswith("mine: rendering/from-image/"))
+    assert lines == sorted(lines), "the order of the suite says which object and material a name stands for"
+    assert not any(scene.key in line or f"{edit.folder}/{edit.answer}" in line for line in lines)
+    assert any(f"{edit.folder}/edit_" in line for line in lines)
     write_missing(tmp_path, {})
     assert not (tmp_path / "missing.txt").exists(), "that of an earlier run says nothing of this one"
 
@@ -59,8 +62,8 @@ def test_a_question_without_a_value_is_not_answered(tmp_path: Path, as_folder: b
     missing = unanswered(suite, rows, scenes, [record])
     questions, asked = missing["mine"]
     assert len(questions) == asked - 1
-    assert edit.identity not in questions
-    assert other.identity in questions
+    places = [f"{t.table}/{t.protocol}: {t.folder}/{t.answer}" if as_folder else t.identity for t in (edit, other)]
+    assert [place in questions for place in places] == [False, True]
     assert unanswered(suite, rows[:1], scenes, [record]) == {}
     said: list[str] = []
     files = missing_answers(suite, rows, scenes)

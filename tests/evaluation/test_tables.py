@@ -178,6 +178,30 @@ def test_a_cell_on_fewer_samples_than_its_columns_fullest_says_so_and_is_not_ran
         assert text.count("n = 2") == 1 + (text.count("Albedo n = 2"))
 
 
+@pytest.mark.parametrize(("table", "protocol", "quantity"), [
+    ("inverse", "single-image", "albedo"), ("relighting", "from-image-hdri", "relit")
+])  # fmt: skip
+@pytest.mark.parametrize(("level", "ranks"), [(60.0, [1, None, 2]), (45.0, [2, 1, None])])
+def test_a_row_that_knows_the_truth_is_not_ranked(
+    table: str, protocol: str, quantity: str, level: float, ranks: list[int | None]
+) -> None:
+    """Its maps are the truth but for rounding, or its pictures exceed the noise ceiling."""
+    key, methods = metric_key(quantity, "psnr"), {"good": 30.0, "told": level, "bad": 20.0}
+    gains = {f"{quantity}.if_shifted": -20.0}  # as a stranger's records have them
+    records = [
+        Record(table, protocol, method, f"s{i}", f"o{i}", {key: db + 0.1 * (i % 2), **gains})
+        for method, db in (methods | ({"noise-ceiling": 53.0} if quantity == "relit" else {})).items()
+        for i in range(4)
+    ]
+    kinds: dict[str, Any] = {"noise-ceiling": "ceiling"}
+    run = replace(RUN, methods=tuple(MethodInfo(m, m, kinds.get(m, "external")) for m in (*methods, "noise-ceiling")))
+    found = build_table(TABLES[table], records, run, protocol=protocol)
+    place = [column.key(found.variant) for column in found.columns].index(key)
+    by_label = {r.label: r.cells[place].measured_rank for r in found.rows}
+    assert [by_label[method] for method in methods] == ranks
+    assert any(note.startswith("Not ranked") and note.endswith(": told.") for note in found.notes) == (level > 50)
+
+
 def test_a_row_that_answers_one_question_in_full_is_complete() -> None:
     found = counted({"a": 8, "b": 8}, {"a": 4, "b": 4, "c": 4})
     assert fewer(found) == ""

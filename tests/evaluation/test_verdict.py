@@ -318,6 +318,26 @@ def test_what_few_objects_leave_undecided_is_open(objects: int, sign: str) -> No
     assert str(found).startswith(sign)
 
 
+def test_what_a_stranger_shows_on_questions_of_its_choice_does_not_hold() -> None:
+    level = np.linspace(15, 20, 12)
+    claim = next(claim for claim in stranger_claims("a") if (claim.quantity, claim.b) == ("albedo", "mean-albedo"))
+    lights = {f"s{i}": (f"l{i}",) for i in range(12)}
+    for answered, by, word in ((12, 3.0, "HOLDS"), (10, 3.0, "open"), (10, -3.0, "FAILS")):
+        records = [*rows("a", ALBEDO, level[:answered] + by), *rows("mean-albedo", ALBEDO, level)]
+        (found,) = findings(records, [claim], lights)
+        assert found.word == word
+        assert (found.other_lights == "holds") == (word == "HOLDS")
+    (ours,) = findings(records, [replace(claim, in_full=False, a="mean-albedo", b="a")])
+    assert ours.holds, "our own rows on a part of the scenes are on a fixed one"
+
+
+def test_a_row_that_is_the_truth_fails_by_name() -> None:
+    records = [replace(r, values={**r.values, "albedo.if_shifted": -20.0}) for r in rows("a", ALBEDO, np.full(8, 60.0))]
+    said = "  FAILS  a: its answers are the truth but for rounding: albedo (8 of 8 pictures) (was it told?)\n"
+    assert said in verdict_text(records, run_of(a="external"), CHECK)
+    assert said not in verdict_text(rows("a", ALBEDO, np.full(8, 60.0)), run_of(a="reference"), CHECK)
+
+
 def test_a_row_breaches_the_ceiling_where_its_interval_over_objects_does() -> None:
     """Not where samples alone would say so, nor on one object, nor where the truth has no noise; in PSNR alone."""
     ceiling = np.linspace(40, 45, 16)

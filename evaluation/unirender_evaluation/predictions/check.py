@@ -39,6 +39,7 @@ SAME = 1e-3  # difference of two channels, below that of 8 bits
 # Of `bench export`, `decompose`.
 IGNORED = ("image.png", "mask.exr", "meta.json", *LIGHT_FILES, "environment.png", "mask.png")
 GIVEN = ("given.exr", "environment.exr")  # of `bench export`, in an answer's folder
+EXPORTED = "the folders' names of `unirender bench export`,"
 
 
 class PredictionError(UnirenderError):
@@ -51,11 +52,13 @@ class PredictionError(UnirenderError):
 
 
 def _shortened(problems: list[str]) -> Iterator[str]:
-    """The lines; of those that say the same of files of one name, but for numbers, `SHOWN` and how many more."""
+    """The lines; of those that say the same of files of one name, or of folders, but for numbers, `SHOWN` and how many
+    more."""
     alike: dict[tuple[str, str], list[str]] = {}
     for problem in problems:
         place, _, said = problem.partition(": ")
-        alike.setdefault((Path(place).name, re.sub(r"[\d.]+", "0", said)), []).append(problem)
+        file = Path(place).name if Path(place).suffix else ""
+        alike.setdefault((file, re.sub(r"[\d.]+", "0", said)), []).append(problem)
     for lines in alike.values():
         yield from lines[:SHOWN]
         if len(lines) > SHOWN:
@@ -92,7 +95,7 @@ def check_predictions(rows: Iterable[Row], suite: Suite) -> None:
     """
     folders = [row.predictions for row in rows if row.predictions is not None]
     asked = questions(suite) if folders else {}
-    problems = [problem for folder in folders for problem in folder_problems(folder, asked, suite.spec.name)]
+    problems = [problem for folder in folders for problem in folder_problems(folder, asked, suite.spec.name, EXPORTED)]
     problems += [problem for folder in folders for problem in _other_truth(folder.folder, asked, suite)]
     if problems:
         raise PredictionError(problems)
@@ -113,8 +116,10 @@ def questions(suite: Suite) -> dict[str, Question]:
     return asked
 
 
-def folder_problems(predictions: PredictionFolder, asked: dict[str, Question], suite: str) -> list[str]:
-    """All that is wrong with one folder, a line each."""
+def folder_problems(
+    predictions: PredictionFolder, asked: dict[str, Question], suite: str, names: str = "names"
+) -> list[str]:
+    """All that is wrong with one folder, a line each; `names`: what those of the pictures' folders are."""
     found: list[str] = []
     try:
         _ = predictions.conventions
@@ -133,7 +138,7 @@ def folder_problems(predictions: PredictionFolder, asked: dict[str, Question], s
             answered += len(readable)
             found += [problem for file in readable for problem in _file_problems(predictions, file, asked[path.name])]
         elif path.is_dir():
-            found.append(_unknown_picture(path, asked, suite))
+            found.append(_unknown_picture(path, asked, suite, names))
         elif path.name != FILE and _is_settings(path):
             found.append(_unread_settings(path, predictions.folder))
         elif path.suffix.lower() in PICTURE_LIKE:
@@ -143,7 +148,7 @@ def folder_problems(predictions: PredictionFolder, asked: dict[str, Question], s
     return found
 
 
-def _unknown_picture(path: Path, asked: dict[str, Question], suite: str) -> str:
+def _unknown_picture(path: Path, asked: dict[str, Question], suite: str, names: str) -> str:
     """What is wrong with a folder that is no picture's; one that has pictures' folders is another method's, or packed
     once more."""
     inside = sum(inner.is_dir() and inner.name in asked for inner in _visible(path))
@@ -164,7 +169,7 @@ def _unknown_picture(path: Path, asked: dict[str, Question], suite: str) -> str:
     there = path.with_name(close[0])  # on a file system without case it may be this very folder
     other = bool(twins) and there.is_dir() and not there.samefile(path)
     both = f"; {close[0]} is there, too: keep one of them" if other else ""
-    return f"{path}: the suite {suite!r} has no such picture, expected names like {close[0]}{both}"
+    return f"{path}: the suite {suite!r} has no such picture, expected {names} like {close[0]}{both}"
 
 
 def _visible(folder: Path) -> Iterator[Path]:

@@ -1,7 +1,6 @@
 """A folder of somebody's predictions as a benchmark row: `--predictions NAME=FOLDER`.
 
-One subfolder per picture, named as in the folder that `unirender bench export` writes (`<scene>_m050_r050`: the suite's
-own name of the picture):
+One subfolder per picture, under the neutral name that it has in the folder that `unirender bench export` writes:
 
     <picture>/intrinsics.exr            maps under the contract's channel names (albedo.R .. roughness.Y ..), linear;
                                         or single maps:

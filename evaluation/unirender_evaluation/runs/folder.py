@@ -3,7 +3,7 @@ written."""
 
 import contextlib
 import errno
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -12,7 +12,7 @@ from unirender.system.whole_files import replace_file
 from unirender_evaluation.records import Record
 from unirender_evaluation.rows import Row
 from unirender_evaluation.suites.suite import Scene, Suite
-from unirender_evaluation.task import PROTOCOLS
+from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import tasks
 
 MISSING = "missing.txt"
@@ -46,11 +46,11 @@ def writing_run(folder: Path) -> Iterator[None]:
 
 def missing_answers(suite: Suite, rows: Sequence[Row], scenes: list[Scene]) -> dict[str, tuple[list[str], int]]:
     """Of each row that is a folder, by its label: the questions without a file, and how many the run has."""
-    folders = [(row.info.label, row.predictions) for row in rows if row.predictions is not None]
+    folders = [row for row in rows if row.predictions is not None]
     every = [task for question in PROTOCOLS for task in tasks(suite, *question, scenes)] if folders else []
     return {
-        label: ([task.identity for task in every if not predictions.has(task)], len(every))
-        for label, predictions in folders
+        row.info.label: (_names(row, (task for task in every if not row.answers(task, scenes))), len(every))
+        for row in folders
     }
 
 
@@ -61,10 +61,21 @@ def unanswered(
 
     A plug-in returned None there; of a folder there is no file, or one of maps that the question does not ask for.
     """
-    strangers = [row.info for row in rows if row.info.kind == "external"]
-    every = [task.identity for question in PROTOCOLS for task in tasks(suite, *question, scenes)] if strangers else []
+    strangers = [row for row in rows if row.info.kind == "external"]
+    every = [task for question in PROTOCOLS for task in tasks(suite, *question, scenes)] if strangers else []
     found = {(r.method, f"{r.table}/{r.protocol}/{r.sample}") for r in records}
-    return {info.label: ([name for name in every if (info.key, name) not in found], len(every)) for info in strangers}
+    return {
+        row.info.label: (_names(row, (t for t in every if (row.info.key, t.identity) not in found)), len(every))
+        for row in strangers
+    }
+
+
+def _names(row: Row, questions: Iterable[Task]) -> list[str]:
+    """Questions as a stranger knows them, sorted: to a folder by the file that would answer, whose neutral name says
+    neither object nor material, nor does its place in the list."""
+    if row.predictions is None:
+        return sorted(task.identity for task in questions)
+    return sorted(f"{task.table}/{task.protocol}: {task.folder}/{task.answer}" for task in questions)
 
 
 def write_missing(folder: Path, missing: Mapping[str, tuple[list[str], int]]) -> None:

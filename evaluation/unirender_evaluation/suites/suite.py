@@ -36,6 +36,7 @@ from unirender_evaluation.suites.truth_file import (
 )
 
 CACHE_BYTES = 512 * 2**20  # of decoded members that a suite keeps
+NAME_DIGITS = 12  # of a neutral name
 
 __all__ = ["MetallicRoughness", "Scene", "Suite", "SuiteSpec", "load_suite", "material_key"]
 
@@ -75,7 +76,9 @@ class Suite:
                 f"{spec.truth_sha256 or 'nothing'}; restore the file, or remake it with {truth_command(spec)}"
             )
         self._members = list_tar(path)
-        self.provenance: dict = json.loads(self._member("suite.json"))
+        description = self._member("suite.json")
+        self.provenance: dict = json.loads(description)
+        self._description_sha256 = hashlib.sha256(description).hexdigest()
         self._cache: OrderedDict[str, Channels] = OrderedDict()
         self._cached_bytes = 0
         self._hashes: dict[str, str] = {}
@@ -148,6 +151,11 @@ class Suite:
                 digest.update(repr(row).encode() + hashlib.sha256(self._member(light_member(row.light))).digest())
             self._hashes[scene.object] = digest.hexdigest()
         return self._hashes[scene.object]
+
+    def neutral_name(self, what: str) -> str:
+        """A name that says nothing of what it names: a hash that takes what the truth's file says of itself (measured
+        noise, exposures), without which nobody can try what gives it."""
+        return hashlib.sha256(f"{self._description_sha256}/{what}".encode()).hexdigest()[:NAME_DIGITS]
 
     def scene(self, key: str) -> Scene:
         """The scene of that key.

@@ -6,7 +6,7 @@ so that "given" inputs can never stand beside them. Nothing is printed without i
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,7 @@ from unirender_evaluation.tables.notes import table_notes
 from unirender_evaluation.tables.protocol import protocol_line
 from unirender_evaluation.tables.published import PublishedRow, published_tables
 from unirender_evaluation.tables.specs import GRID_TOLERANCE, PROTOCOLS, TABLES, Column, TableSpec
+from unirender_evaluation.tables.told import told_the_truth
 
 OTHER_AXES = {"linear": "linear light", "aligned": "scale-aligned", "aligned_rgb": "scale-aligned per channel"}
 RANKED_KINDS = ("ours", "paper", "optimisation", "baseline", "external", "trivial")  # bounds are no competitors
@@ -137,7 +138,8 @@ def build_table(
     rows = _merge(published_tables()[published_in] if published_in else (), spec, measured)
     rows = [row for row in rows if any(cell != Cell() for cell in row.cells)]
     total = max((row.n for row in rows), default=0)
-    rows = _rank(spec, rows)
+    told = told_the_truth(spec, chosen, variant)
+    rows = _rank(spec, rows, told)
     return Table(
         name=spec.name,
         title=spec.title,
@@ -148,7 +150,7 @@ def build_table(
         columns=spec.columns,
         rows=tuple(rows),
         protocol=protocol_line(declared, variant, run, methods, chosen, spec.columns, published_in, lights is not None),
-        notes=table_notes(spec, rows, variant, lights is not None),
+        notes=table_notes(spec, rows, variant, told, lights is not None),
         watermark=None if run.limit is None else f"--limit {run.limit}: a partial run, not a result",
         n=total,
     )
@@ -245,9 +247,9 @@ def _merge(published: Sequence[PublishedRow], spec: TableSpec, measured: Mapping
     return rows + sorted(left.values(), key=lambda row: KIND_ORDER.index(row.kind))
 
 
-def _rank(spec: TableSpec, rows: Sequence[Row]) -> list[Row]:
+def _rank(spec: TableSpec, rows: Sequence[Row], told: Collection[str] = ()) -> list[Row]:
     """Ranks 1 and 2 per column on rounded values; a cell on fewer samples than the column's fullest is not ranked, nor
-    is one that is infinite by a part of its samples, or by a fit.
+    is one that is infinite by a part of its samples, or by a fit, nor one of a row that was `told` the truth.
     """
     short = [short_cells(rows, row) for row in rows]
     ranked = [list(row.cells) for row in rows]
@@ -255,7 +257,7 @@ def _rank(spec: TableSpec, rows: Sequence[Row]) -> list[Row]:
         cells = [row.cells[i] for row in rows]
         published = {r: cell.published for r, cell in enumerate(cells) if cell.published is not None}
         means = {r: cell.measured.mean for r, cell in enumerate(cells) if cell.measured is not None}
-        competing = {r: mean for r, mean in means.items() if rows[r].kind in RANKED_KINDS and i not in short[r]}
+        competing = {r: mean for r, mean in means.items() if _competes(rows[r], told) and i not in short[r]}
         competing = {r: mean for r, mean in competing.items() if not cells[r].exact}
         published_ranks, measured_ranks = _ranks(published, column.metric), _ranks(competing, column.metric)
         trivial = [mean for r, mean in means.items() if rows[r].kind == "trivial"]
@@ -269,6 +271,10 @@ def _rank(spec: TableSpec, rows: Sequence[Row]) -> list[Row]:
                 dagger=r in published and any(column.metric.better(mean, published[r]) for mean in trivial),
             )
     return [dataclasses.replace(row, cells=tuple(cells)) for row, cells in zip(rows, ranked, strict=True)]
+
+
+def _competes(row: Row, told: Collection[str]) -> bool:
+    return row.kind in RANKED_KINDS and row.key not in told
 
 
 def _ranks(values: Mapping[int, float], metric: Metric) -> dict[int, int]:

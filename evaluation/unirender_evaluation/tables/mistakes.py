@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from unirender_evaluation.light_metrics import SCALED_LOG_RMSE
 from unirender_evaluation.methods.mistakes import AT_WHITE, BIAS, EXACT, GAINS, MISTAKES, PLACE
 from unirender_evaluation.metrics import metric_key
 from unirender_evaluation.records import Record
@@ -25,6 +26,7 @@ TRUE: tuple[tuple[str, str, Callable[[float], bool], float], ...] = (  # of maps
     ("normal", metric_key("normal", "angle_deg"), lambda degrees: degrees < 0.5, 0.0),
     ("roughness", metric_key("roughness", "mse"), lambda mse: mse < 1e-5, 0.75),
     ("metallic", metric_key("metallic", "mse"), lambda mse: mse < 1e-5, 0.75),
+    ("light", metric_key("environment", SCALED_LOG_RMSE), lambda error: error < 0.05, 0.75),
 )  # quantity, metric, whether it is the truth, and in which share of pictures more: a constant is right on some
 MOST = 0.75  # of the pictures that say anything
 LEAST_DB = 0.1  # smaller gains say nothing, as those of a constant or of an object of one colour

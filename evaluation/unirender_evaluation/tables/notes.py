@@ -1,7 +1,7 @@
 """What is said below a table: the rows' notes, who has fewer samples, what a sign in a cell means, what is stored."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 from unirender_evaluation.metrics import Variant
@@ -18,13 +18,16 @@ if TYPE_CHECKING:
     from unirender_evaluation.tables.build import Row
 
 
-def table_notes(spec: TableSpec, rows: Sequence["Row"], variant: Variant, over_lights: bool = False) -> tuple[str, ...]:
+def table_notes(
+    spec: TableSpec, rows: Sequence["Row"], variant: Variant, told: Collection[str] = (), over_lights: bool = False
+) -> tuple[str, ...]:
     """The notes, in their order.
 
     Args:
         spec: of the table.
         rows: ranked.
         variant: how its numbers are taken.
+        told: keys of the rows that are nearer to the truth than any picture tells (`told`).
         over_lights: whether its intervals are over lights, too.
     """
     shown = {column.group for column in spec.columns}
@@ -36,6 +39,12 @@ def table_notes(spec: TableSpec, rows: Sequence["Row"], variant: Variant, over_l
     fewer = [f"{row.label} ({said})" for row in rows if (said := _counts_said(spec, rows, row))]
     if fewer:
         notes.append(f"Measured on fewer samples than others and not ranked: {'; '.join(fewer)}.")
+    known = [row.label for row in rows if row.key in told]
+    if known:
+        notes.append(
+            "Not ranked, since answers are the truth but for rounding or exceed the noise ceiling (verdict): "
+            f"{'; '.join(known)}."
+        )
     measured = [cell.measured for row in rows for cell in row.cells]
     notes += unprinted_note(measured)
     if over_lights and any(e and math.isfinite(e.mean) and math.isnan(e.half_width) for e in measured):
