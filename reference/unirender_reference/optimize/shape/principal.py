@@ -20,7 +20,7 @@ HALF, CELLS = 1.3, 40  # of the grid, whose points are counted
 SHIFTS = (-0.06, -0.04, -0.02, 0.02, 0.04, 0.06)  # of the frame
 LARGER = 1.08
 FEWEST = (
-    2000  # points: of sheets, which the grid does not resolve, 15 to 1500 were counted; of other objects 2900 and more
+    2000  # points: of sheets, which the grid does not resolve, 15 to 1500 were counted; of other objects 2880 and more
 )
 
 
