@@ -8,6 +8,7 @@ import torch
 
 from unirender_reference import principled
 from unirender_reference.backend import mitsuba
+from unirender_reference.scene import parameter_name
 
 DOUBLE = torch.float64
 
@@ -121,3 +122,39 @@ def test_mitsubas_sampler_follows_its_density(density_roughness: float) -> None:
     _, density = chi2.BSDFAdapter("principled", text(density_roughness), wi=wi)
     test = chi2.ChiSquareTest(chi2.SphericalDomain(), sample, density, sample_dim=3, sample_count=400_000, res=51)
     assert test.run(significance_level=1e-4, quiet=True) == (density_roughness == 0.5)
+
+
+@pytest.mark.parametrize("roughness", [0.05, 0.1])
+def test_mitsubas_derivative_by_a_small_roughness_is_exact_and_a_difference_is_not(roughness: float) -> None:
+    """For the same directions, in double precision: what differs in finite differences is their step."""
+    mi = mitsuba()
+    import drjit as dr
+
+    count, values = 1 << 14, {"base_color": {"type": "rgb", "value": [0.6, 0.4, 0.2]}, "metallic": 0.3}
+    bsdf = mi.load_dict({"type": "principled", "roughness": roughness, **values})
+    point = dr.zeros(mi.SurfaceInteraction3f, count)
+    point.wi, random = mi.Vector3f(0.6, 0, 0.8), mi.PCG32(size=count)
+    drawn, _ = bsdf.sample(mi.BSDFContext(), point, random.next_float32(), mi.Point2f(random.next_float32()))
+    parameters = mi.traverse(bsdf)
+    parameter = mi.Float(roughness)
+    dr.enable_grad(parameter)
+    parameters[parameter_name(parameters, "roughness.value")] = parameter
+    parameters.update()
+    shown = bsdf.eval(mi.BSDFContext(), point, drawn.wo)[0]
+    dr.forward(parameter)
+    wo = torch.from_numpy(np.array(drawn.wo).T).double()
+    wi = torch.tensor([[0.6, 0, 0.8]], dtype=DOUBLE).expand_as(wo)
+    density = torch.from_numpy(np.array(drawn.pdf)).double()
+    weight = torch.where(density > 0, (1 + torch.sin(7 * wo[:, 0])) / density.clamp_min(1e-30), 0)  # light / density
+
+    def reflected(rough: torch.Tensor) -> torch.Tensor:
+        base, metal = material((0.6, 0.4, 0.2), 0.3)
+        return (principled.evaluate(wi, wo, base, rough, metal)[:, 0] * weight).sum()
+
+    rough = torch.tensor(roughness, dtype=DOUBLE)
+    exact = float(torch.func.grad(reflected)(rough))
+    found = float((torch.from_numpy(np.array(dr.grad(shown))).double() * weight).sum())
+    assert abs(found / exact - 1) < 1e-4
+    step = roughness / 5
+    central = float(reflected(rough + step) - reflected(rough - step)) / (2 * step)
+    assert abs(central / exact - 1) > 0.01

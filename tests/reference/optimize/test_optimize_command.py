@@ -382,12 +382,19 @@ def test_the_camera_is_that_of_the_header_or_of_the_normals(tmp_path: Path, capl
         read_picture_input(tmp_path / "one.exr", normal=tmp_path / "gone")
 
 
-def test_of_a_result_folder_the_normals_picture_counts_and_no_other_maps(tmp_path: Path):
+def test_of_a_result_folder_the_normals_picture_counts_and_no_other_maps(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
     normal, mask = np.zeros((12, 16, 3), np.float32), np.ones((12, 16, 1), np.float32)
     normal[..., 2] = 1
-    write_result(tmp_path, Intrinsics(normal=normal, albedo=normal, mask=mask, camera=Camera()), {})
+    maps = Intrinsics(normal=normal, mask=mask, camera=Camera())
+    write_result(tmp_path / "alone", maps, {})
+    read_normals(tmp_path / "alone")
+    assert not caplog.messages
+    write_result(tmp_path, maps.replace(albedo=normal, metallic=mask), {})
     write_png(tmp_path / "albedo.png", normal[::2, ::2])  # of another size
     np.testing.assert_array_equal(read_normals(tmp_path), normal)
+    assert caplog.messages == [f"{tmp_path}: only its normals are used, not its albedo, metallic"]
     write_png(tmp_path / "normal.png", normal[..., ::-1] / 2 + 0.5)
     np.testing.assert_allclose(read_normals(tmp_path), normal[..., ::-1], rtol=0, atol=0.01)
 

@@ -10,10 +10,11 @@ import pytest
 from posed_spheres import blank_views, mask_views
 from reference_scenes import environment, sphere
 
+from unirender.camera import Camera
 from unirender.errors import UnirenderError, UsageError
 from unirender_reference.optimize.multiview.config import OptimizeConfig
 from unirender_reference.optimize.multiview.run import optimize
-from unirender_reference.optimize.shape import tracer
+from unirender_reference.optimize.shape import principal, tracer
 from unirender_reference.optimize.shape.bounds import check_masks, check_reach
 from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.charts import welded
@@ -22,6 +23,7 @@ from unirender_reference.optimize.shape.fit import MeshFit
 from unirender_reference.optimize.shape.hull import extract, mask_distance, visual_hull
 from unirender_reference.optimize.shape.measure import score_shape
 from unirender_reference.optimize.shape.placement import placed, sphere_of_masks
+from unirender_reference.optimize.shape.principal import shifted_principal
 from unirender_reference.optimize.shape.reconstruct import reconstruct
 from unirender_reference.optimize.shape.silhouette import outline
 from unirender_reference.optimize.shape.topology import mesh_edges, neighbours, vertex_normals
@@ -160,6 +162,28 @@ def test_masks_that_do_not_bound_the_object_are_refused_before_anything_is_writt
     assert "3 pictures and no mesh: the shape will be rough" in caplog.text
     with pytest.raises(UnirenderError, match=r"reaches 1\.4 times as far"):
         check_reach(1.4, 5)
+
+
+@pytest.mark.parametrize("moved", [0.06, -0.06, 0.0, 0.004])
+def test_a_principal_point_that_the_masks_contradict_is_named(moved: float, caplog: pytest.LogCaptureFixture) -> None:
+    views = _lit(mask_views(make_object(0, "train"), 8, SIZE))
+    camera = Camera(principal=(0.5 + moved, 0.5))
+    views = Views(tuple(dataclasses.replace(view, camera=camera) for view in views.seen))
+    with caplog.at_level(logging.WARNING, "unirender"):
+        check_masks(placed(views, sphere_of_masks(views)), 64)
+    said = f"the masks agree better with cx moved by about {-SIZE * moved:+.0f} pixels: is the principal point right?"
+    assert caplog.messages == ([said] if abs(moved) > 0.01 else [])
+
+
+def test_a_sheet_does_not_tell_the_principal_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    obj = make_object(24, "train")
+    vertices = obj.vertices * np.array([1, 0.05, 1], np.float32)
+    sheet = dataclasses.replace(obj, vertices=vertices / np.linalg.norm(vertices, axis=1).max())
+    views = _lit(mask_views(sheet, 8, 64))
+    views = placed(views, sphere_of_masks(views)).seen
+    assert shifted_principal(views) is None
+    monkeypatch.setattr(principal, "FEWEST", 0)
+    assert shifted_principal(views) is not None
 
 
 def test_a_world_that_is_not_that_of_the_unit_sphere_is_named(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from unirender_reference.optimize.shape.cameras import Cameras
 from unirender_reference.optimize.shape.coverage import masks_of
 from unirender_reference.optimize.shape.hull import hull_reach, visual_hull
 from unirender_reference.optimize.shape.placement import sphere_of_masks
+from unirender_reference.optimize.shape.principal import shifted_principal
 from unirender_reference.optimize.views import Views
 from unirender_reference.shapes.mesh_object import RECONSTRUCTION_TOLERANCE
 
@@ -25,7 +26,7 @@ _log = logging.getLogger("unirender.optimize")
 
 
 def check_masks(views: Views, cells: int) -> None:
-    """Looks whether masks can tell the shape; warns of few views.
+    """Looks whether masks can tell the shape; warns of few views, and of a principal point that they contradict.
 
     Args:
         views: with the object in the unit sphere of their world.
@@ -44,6 +45,10 @@ def check_masks(views: Views, cells: int) -> None:
         visual_hull(masks, cameras, cells)  # finer: something thin may be there
     if len(masks) < FEW_VIEWS:
         _log.warning("%d pictures and no mesh: the shape will be rough, expected %d or more", len(masks), FEW_VIEWS)
+    if shifted := shifted_principal(views.seen):
+        _log.warning(
+            "the masks agree better with %s moved by about %+.0f pixels: is the principal point right?", *shifted
+        )
 
 
 def check_reach(reach: float, count: int) -> None:

@@ -79,7 +79,21 @@ def hull_reach(masks: Float[np.ndarray, "k h w"], cameras: Cameras) -> float:
         masks: coverage of each view.
         cameras: of the same views.
     """
-    axis = np.linspace(-WIDE, WIDE, WIDE_CELLS + 1)
+    return float(np.linalg.norm(points_inside(masks, cameras, WIDE, WIDE_CELLS), axis=1).max(initial=0))
+
+
+def points_inside(
+    masks: Float[np.ndarray, "k h w"], cameras: Cameras, half: float, cells: int
+) -> Float[np.ndarray, "n 3"]:
+    """The points of a grid over [-half, half]^3 that lie inside all masks.
+
+    Args:
+        masks: coverage of each view.
+        cameras: of the same views.
+        half: half side of the grid.
+        cells: along each side.
+    """
+    axis = np.linspace(-half, half, cells + 1)
     points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     for view, mask in enumerate(masks):
         points = points[cameras.depth(points, view) > 0]
@@ -87,7 +101,7 @@ def hull_reach(masks: Float[np.ndarray, "k h w"], cameras: Cameras) -> float:
         inside = (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height)
         points, column, row = points[inside], column[inside].astype(int), row[inside].astype(int)
         points = points[mask[row, column] > 0.5]
-    return float(np.linalg.norm(points, axis=1).max(initial=0))
+    return points
 
 
 def extract(

@@ -22,6 +22,7 @@ MOST_SATURATED = 0.99  # share of the object's display values
 LEAST_LENGTH = 0.5  # of a stored normal
 SHORTEST = 1e-6  # length of a mean that still has a direction
 MOST_AWAY = 0.5  # share of the object whose normals look away from the camera
+MATERIALS = ("albedo", "roughness", "metallic")
 FLIPPED = -0.3  # agreement of an axis with the outline, from -1 to 1: true normals of 24 objects have 0.69 and more
 
 _log = logging.getLogger("unirender.optimize")
@@ -181,7 +182,7 @@ def check_axes(
 
 
 def read_normals(path: Path) -> Float[np.ndarray, "h w 3"]:
-    """Normals in camera axes as they are stored.
+    """Normals in camera axes as they are stored; that other maps beside them are not used is logged.
 
     Args:
         path: a result folder or an EXR with normal.X/Y/Z, or a picture of (n + 1) / 2.
@@ -197,6 +198,8 @@ def read_normals(path: Path) -> Float[np.ndarray, "h w 3"]:
                 f"{path}: has no normals, expected the channels normal.X, normal.Y, normal.Z; "
                 "leave --normal out, or give another file"
             )
+        if unused := [name for name in MATERIALS if name in stored.present]:
+            _log.warning("%s: only its normals are used, not its %s", path, ", ".join(unused))
         return normal
     return 2 * stored_values(checked_file(path))[..., :3] - 1
 
