@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender_reference import backend, materials, passes, scene
+from unirender_reference import backend, materials, passes, sample_counts, scene
 from unirender_reference.lights import Light
 from unirender_reference.multiview import orbit, pose_towards
 from unirender_reference.render import (
@@ -386,7 +386,7 @@ def test_the_hash_does_not_depend_on_the_type_of_a_number() -> None:
 @pytest.mark.parametrize("spp", [67, 704])
 def test_geometry_takes_the_next_full_grid(renderer: Renderer, spp: int) -> None:
     """Any number of samples that an image takes: 704 in 8 batches are 11 passes of 64, but no full grid in one."""
-    taken = passes.next_spp(spp, 1, passes.SAMPLES_PER_PASS // SIZE**2)
+    taken = sample_counts.next_spp(spp, 1, sample_counts.SAMPLES_PER_PASS // SIZE**2)
     assert spp < taken < 1.1 * spp
     for name, picture in renderer.geometry(spp, 1).require("mask", "normal", "albedo").items():
         np.testing.assert_array_equal(picture, renderer.geometry(taken, 1).require(name)[name])

@@ -32,7 +32,7 @@ def solution_images(solution: Solution, views: Sequence[View], spp: int, seed: i
     Args:
         solution: what is shown.
         views: cameras; all pictures have one size.
-        spp: samples per pixel (`passes.pass_count` says which numbers serve).
+        spp: samples per pixel (`sample_counts.pass_count` says which numbers serve).
         seed: equal seeds give equal pictures.
     """
     scene, images = solution_scene(solution), []
