@@ -12,7 +12,8 @@ from scipy.stats import chi2
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender_reference import backend, materials, passes, sample_counts, scene
+from unirender_reference import backend, editable_scene, materials, passes, sample_counts, scene
+from unirender_reference.envmap import MOST_RADIANCE, envmap_data
 from unirender_reference.lights import Light
 from unirender_reference.multiview import orbit, pose_towards
 from unirender_reference.render import (
@@ -25,7 +26,7 @@ from unirender_reference.render import (
     scene_hash,
     scene_hashes,
 )
-from unirender_reference.scene import MOST_RADIANCE, envmap_data, sensor_at, sensor_dict
+from unirender_reference.sensors import sensor_at, sensor_dict
 from unirender_reference.shapes import bounding_sphere
 
 SIZE = 32
@@ -141,7 +142,7 @@ def test_all_buffers_share_one_scene(renderer: Renderer, monkeypatch: pytest.Mon
     """Loading builds an acceleration structure: once for an object, whatever is rendered of it."""
     loaded = []
     genuine = scene.load_scene
-    monkeypatch.setattr(scene, "load_scene", lambda *args: loaded.append(args) or genuine(*args))
+    monkeypatch.setattr(editable_scene, "load_scene", lambda *args: loaded.append(args) or genuine(*args))
     light = scenes.environment()
     renderer.geometry(16)
     for environment in (light, 2 * light):
