@@ -21,7 +21,8 @@ from unirender_evaluation.metrics import Variant, metric_key
 from unirender_evaluation.public.iiw import Iiw
 from unirender_evaluation.public.maw import Maw, adobe_to_rec709, measured
 from unirender_evaluation.public.metrics import COSINE_DISTANCE, PSNR_H, PSNR_L
-from unirender_evaluation.public.orb import StanfordOrb, contract_environment
+from unirender_evaluation.public.orb import StanfordOrb
+from unirender_evaluation.public.orb_files import contract_environment
 from unirender_evaluation.public.orb_frames import Capture, Photograph, captures, difference_deg, object_of
 from unirender_evaluation.public.sets import Answer, PublicSet, PublicSetError, block_mean, shrunk
 
