@@ -19,6 +19,7 @@ VOCABULARY = {
         "camera",
         "color",
         "composite",
+        "environment_brdf",
         "errors",
         "exr",
         "files",
