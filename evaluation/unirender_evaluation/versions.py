@@ -125,6 +125,7 @@ NOT_IN_RECORDS = (
     "multiview",
     "option_checks",
     "optimize/*",
+    "output_files",
     "plan",
     "principled",
     "processes",
