@@ -6,23 +6,20 @@ import numpy as np
 import pytest
 from doc_blocks import DOCS, ROOT
 
+from unirender_evaluation.claims import OPTIMISED_ON_MESH, OURS, SHADOWED, SPLIT_SUM
 from unirender_evaluation.comparisons import Selection, compare, values_of
-from unirender_evaluation.results.file import from_document, read_document
-from unirender_evaluation.results.findings import Question
-from unirender_evaluation.results.page import Page
-from unirender_evaluation.results.questions import (
+from unirender_evaluation.pages.findings import Question
+from unirender_evaluation.pages.page import Page
+from unirender_evaluation.pages.questions import (
     BY_TARGET,
     NOT_CLOSED,
-    OPTIMISED_ON_MESH,
-    OURS,
     SECTIONS,
-    SHADOWED,
-    SPLIT_SUM,
     STANDARD,
     by_target,
     edits,
     lit,
 )
+from unirender_evaluation.results.file import from_document, read_document
 from unirender_evaluation.suites.suite import load_suite
 
 ELSEWHERE = ("Joint training and the cycle", "What these tables cannot say")  # sections with figures of other records
