@@ -105,6 +105,7 @@ MITSUBA_ROW = ("methods/mitsuba",)
 NOT_IN_RECORDS = (
     "checks/*",
     "cluster",
+    "cluster_machine",
     "commands",
     "dataset*",
     "denoise",
