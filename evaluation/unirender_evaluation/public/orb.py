@@ -34,10 +34,11 @@ from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.methods.suspicions import suspicions_of_maps
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.public import orb_scoring as scoring
+from unirender_evaluation.public.files import PublicSetError, missing_files, need_folder
 from unirender_evaluation.public.metrics import ERODED, eroded
 from unirender_evaluation.public.orb_files import OrbFiles, frame_truths, light_file
 from unirender_evaluation.public.orb_frames import HDR, LDR, Capture, Photograph, captures, relightings
-from unirender_evaluation.public.sets import MAPS, Answer, PublicSetError, Sample, missing_files, need_folder
+from unirender_evaluation.public.sets import MAPS, Answer, Sample
 from unirender_evaluation.tables.specs import TableSpec
 
 NAME = "stanford-orb"
@@ -57,7 +58,7 @@ class StanfordOrb:
 
     name = NAME
     tables: tuple[TableSpec, ...] = (scoring.MAPS_TABLE, scoring.RELIT_TABLE)
-    modules: tuple[str, ...] = ("public/orb*", "public/metrics", "public/sets")
+    modules: tuple[str, ...] = ("public/orb*", "public/files", "public/metrics", "public/sets")
     variant = Variant("masked")
     averaged_first: str | None = "captures"
 

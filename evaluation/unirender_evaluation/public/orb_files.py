@@ -10,10 +10,10 @@ from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
 from unirender.exr import channels_rgb, read_exr
 from unirender_evaluation.methods.method import quantise
+from unirender_evaluation.public.files import block_mean, read_array, read_display, read_photograph
 from unirender_evaluation.public.metrics import eroded
 from unirender_evaluation.public.orb_frames import HDR, Photograph
 from unirender_evaluation.public.orb_scoring import check_truth
-from unirender_evaluation.public.sets import block_mean, read_array, read_display, read_photograph
 
 MAP_TRUTHS = {"normal": ("surface_normal", (".npy",)), "depth": ("z_depth", (".npy",)),
               "albedo": ("pseudo_gt_albedo", (".png", ".npy"))}  # fmt: skip
