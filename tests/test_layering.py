@@ -21,6 +21,7 @@ VOCABULARY = {
         "camera",
         "color",
         "composite",
+        "environment_brdf",
         "errors",
         "exr",
         "files",

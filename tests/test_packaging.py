@@ -86,6 +86,7 @@ def test_the_wheel_holds_its_data_and_stays_small(wheel: Path) -> None:
     checkpoint_mb = sum(size for name, size in sizes.items() if name.startswith("unirender/checkpoints/")) / 1e6
     assert 0.1 < checkpoint_mb <= MAX_CHECKPOINT_MB
     assert not [name for name in sizes if name.endswith((".pyc", ".DS_Store")) or "__pycache__" in name]
+    assert not [name for name in sizes if name.startswith("unirender_evaluation/pages/")]
 
 
 def test_the_source_distribution_stays_small() -> None:

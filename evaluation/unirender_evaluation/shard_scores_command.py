@@ -53,7 +53,7 @@ class BenchShards:
         from rich.console import Console
 
         from unirender_evaluation.shard_scores import minus, shard_tables
-        from unirender_reference.measure.output import check_file, write_file
+        from unirender_reference.output_files import check_file, write_file
 
         check_file("--out", self.out)
 

@@ -3,7 +3,7 @@
 Samples of one object (several lights, several edits) are not independent, so intervals are over objects: Student's t
 with the variance of a ratio of sums, since objects may have unequal numbers of samples (Cochran 1977, section 6.4); the
 estimate is the plain mean over samples. On draws of 5 to 60 objects from stored results it holds the truth more often
-than a bootstrap of objects does, on average over what is claimed (`results.coverage`).
+than a bootstrap of objects does, on average over what is claimed (`pages.coverage`).
 
 Of two objects Student's t is 12.7 standard errors wide to each side, and has no width at all where the two happen to
 agree: below `FEWEST` objects there is no interval, and nothing is decided.

@@ -105,6 +105,7 @@ MITSUBA_ROW = ("methods/mitsuba",)
 NOT_IN_RECORDS = (
     "checks/*",
     "cluster",
+    "cluster_machine",
     "commands",
     "dataset*",
     "denoise",
@@ -125,6 +126,7 @@ NOT_IN_RECORDS = (
     "multiview",
     "option_checks",
     "optimize/*",
+    "output_files",
     "plan",
     "principled",
     "processes",

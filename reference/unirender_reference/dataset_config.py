@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from unirender.errors import UnirenderError
-from unirender_reference.passes import SAMPLES_PER_PASS, pass_count
+from unirender_reference.sample_counts import SAMPLES_PER_PASS, pass_count
 
 if TYPE_CHECKING:
     from unirender_reference.lights import LightPool

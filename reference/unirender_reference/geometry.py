@@ -12,9 +12,10 @@ from unirender.camera import Camera
 from unirender.intrinsics import Intrinsics
 from unirender_reference import materials
 from unirender_reference.backend import mitsuba
-from unirender_reference.passes import SAMPLES_PER_PASS, derive_seed, next_spp, pass_count
+from unirender_reference.editable_scene import EditableScene
+from unirender_reference.passes import derive_seed
+from unirender_reference.sample_counts import SAMPLES_PER_PASS, next_spp, pass_count
 from unirender_reference.samplers import stratified_sampler
-from unirender_reference.scene import EditableScene
 
 RoughnessMetallic = tuple[float | None, float | None]  # in this order; None is the object's own map
 

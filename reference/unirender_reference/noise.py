@@ -22,7 +22,8 @@ from jaxtyping import Float
 
 from unirender.color import MIN_MASK, display_slope, image_srgb, unpremultiply
 from unirender.errors import UnirenderError
-from unirender_reference.passes import SAMPLES_PER_PASS, Estimate
+from unirender_reference.passes import Estimate
+from unirender_reference.sample_counts import SAMPLES_PER_PASS
 
 FLOOR_BATCHES = 16
 FIRST_SPP = 64

@@ -25,21 +25,21 @@ from unirender.light.environment import as_light
 from unirender.system.machine import memory_excess
 from unirender_reference import exposure
 from unirender_reference.backend import mitsuba
+from unirender_reference.editable_scene import EditableScene
 from unirender_reference.geometry import geometry_buffers
 from unirender_reference.materials import Surface
 from unirender_reference.passes import (
-    SAMPLES_PER_PASS,
     TRUTH_BATCHES,
     Counters,
     Estimate,
     derive_seed,
     mean_estimate,
-    pass_count,
     ratio_estimate,
     render_passes,
 )
-from unirender_reference.scene import EditableScene, sensor_at
+from unirender_reference.sample_counts import SAMPLES_PER_PASS, pass_count
 from unirender_reference.scene_spec import Sample, SceneSpec, object_hash, scene_hash, scene_hashes, shared_scene_hash
+from unirender_reference.sensors import sensor_at
 from unirender_reference.shapes import MeshObject
 
 __all__ = [

@@ -26,8 +26,9 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics, as_numbers
 from unirender.light.environment import as_light
 from unirender.shown import short_repr
-from unirender_reference.passes import NAN_ATTEMPTS, SAMPLES_PER_PASS, Counters, derive_seed, finite_pass, pass_count
-from unirender_reference.scene import envmap_data
+from unirender_reference.envmap import envmap_data
+from unirender_reference.passes import NAN_ATTEMPTS, Counters, derive_seed, finite_pass
+from unirender_reference.sample_counts import SAMPLES_PER_PASS, pass_count
 from unirender_reference.shader import PARAMETERS, Parameter, Shader, gradient, tensors
 from unirender_reference.shapes import MeshObject
 

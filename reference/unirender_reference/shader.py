@@ -26,8 +26,10 @@ from unirender.camera import Camera
 from unirender.errors import UnirenderError
 from unirender_reference.arrays import aligned, components
 from unirender_reference.backend import mitsuba
+from unirender_reference.envmap import envmap_rows
 from unirender_reference.samplers import stratified_sampler
-from unirender_reference.scene import envmap_rows, mesh_shape, sensor_dict
+from unirender_reference.scene import mesh_shape
+from unirender_reference.sensors import sensor_dict
 from unirender_reference.shapes import MeshObject
 
 LEAST_FACING = 0.01  # cosine to which normals that face away from the viewer are bent
@@ -243,7 +245,7 @@ def wrapped(environment: Any) -> Any:
     """A light (eh, ew, 3) as Mitsuba's `envmap` stores it: a copy of the last column before it, of the first behind.
 
     The tensor stays attached: the gradient of both copies returns to the columns that they came from, and that of the
-    rows between those of a light with bright poles to their neighbours (`scene.envmap_rows`).
+    rows between those of a light with bright poles to their neighbours (`envmap.envmap_rows`).
     """
     import drjit as dr
 

@@ -23,13 +23,11 @@ from unirender.errors import UnirenderError
 from unirender.exr import (
     CAMERA_ATTRIBUTE,
     LIGHT_ATTRIBUTE,
-    channels_rgb,
     header_camera,
     image_channels,
     intrinsics_channels,
     intrinsics_from_channels,
     light_sha256,
-    on_pole_grid,
     radiance_fits_half,
     read_exr,
     write_environment,
@@ -40,7 +38,7 @@ from unirender.map_edits import with_edits
 from unirender.map_files import map_files, read_maps, report_unread
 from unirender.new_folders import META_FILE
 from unirender.new_folders import new_folder as new_folder  # known by this name, too
-from unirender.picture_files.display_files import open_picture
+from unirender.stored_light import with_stored_light
 from unirender.visualization import map_picture as map_picture  # likewise
 from unirender.visualization import write_map_png, write_png
 
@@ -144,7 +142,7 @@ def read_result(
         maps, attributes = _maps_of_exr(file, path)
     maps = maps.replace(camera=_camera(path, attributes, fov_deg))
     if light and (path / ENVIRONMENT_FILE).is_file():
-        maps = _with_light(maps, path, attributes.get(LIGHT_ATTRIBUTE))
+        maps = with_stored_light(maps, path / ENVIRONMENT_FILE, attributes.get(LIGHT_ATTRIBUTE))
     return with_edits(maps, path) if edits else maps
 
 
@@ -213,52 +211,6 @@ def _camera_of_header(path: Path, attributes: Mapping[str, str]) -> Camera:
         return Camera.parse(attributes[CAMERA_ATTRIBUTE])
     except UnirenderError as error:
         raise UnirenderError(f"{path}: {error}; pass the field of view (fov_deg, --fov)") from error
-
-
-def _with_light(maps: Intrinsics, folder: Path, sha256: str | None) -> Intrinsics:
-    """The maps with the environment of their folder; without s and d where it was edited since they were written.
-
-    Args:
-        maps: of the folder.
-        folder: with an environment.
-        sha256: of the environment that was written with them, where they state it.
-
-    Raises:
-        UnirenderError: it is broken, a map from elsewhere, whose rows lie otherwise, or one of ours that s and d do not
-            belong to.
-    """
-    file = folder / ENVIRONMENT_FILE
-    channels, attributes = read_exr(file)
-    try:
-        environment = channels_rgb(channels)
-        lit = maps.replace(environment=environment)
-    except UnirenderError as error:
-        raise UnirenderError(f"{file}: {error}") from error
-    ours = on_pole_grid(attributes)
-    if not ours and not (sha256 and _is_size_of(folder / f"{file.stem}.png", environment)):
-        raise UnirenderError(
-            f"{file}: is no environment that unirender wrote, and a lat-long map from elsewhere has to be resampled; "
-            "take it out of the folder and pass it as --environment (with --exposure 0 as bright as it is), in Python "
-            "load_light(path, normalise=False).environment of unirender_reference.lights"
-        )
-    if not sha256 or sha256 == light_sha256(environment):
-        return lit
-    if not ours:
-        logger.warning("%s: edited, so that specular and diffuse follow from it", file)
-        return lit.replace(specular=None, diffuse=None)
-    if maps.specular is not None or maps.diffuse is not None:
-        raise UnirenderError(
-            f"{folder}: {ENVIRONMENT_FILE} is another light than that of the specular and diffuse beside it, which are "
-            "rendered as they are; put it back, and pass the other light as --environment (with --exposure 0 as bright "
-            "as it is), in Python read_result(path, light=False).replace(environment=other, specular=None, "
-            "diffuse=None): they are then derived from it"
-        )
-    return lit
-
-
-def _is_size_of(picture: Path, environment: Float[np.ndarray, "eh ew 3"]) -> bool:
-    """Whether the picture of a light that we wrote has the size of a light that no longer says so, and was edited."""
-    return picture.is_file() and open_picture(picture).size == environment.shape[1::-1]
 
 
 def _camera_of_meta(path: Path) -> Camera | None:

@@ -7,8 +7,8 @@ import pytest
 import scipy.stats
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.results.coverage import bootstrap, coverage_of_draws, least_by_chance, of_few_lights
-from unirender_evaluation.results.coverage import coverage as coverage_of
+from unirender_evaluation.pages.coverage import bootstrap, coverage_of_draws, least_by_chance, of_few_lights
+from unirender_evaluation.pages.coverage import coverage as coverage_of
 from unirender_evaluation.statistics import (
     FEWEST,
     UNPRINTED,

@@ -14,7 +14,8 @@ from unirender.light.environment import mirror_environment, sample_environment
 from unirender.light.surface_light import diffuse_light, specular_light
 from unirender_reference import backend
 from unirender_reference.render import Renderer, SceneSpec, render_sample
-from unirender_reference.scene import load_scene, sensor_dict
+from unirender_reference.scene import load_scene
+from unirender_reference.sensors import sensor_dict
 from unirender_reference.shapes import make_object
 
 SIZE = 24

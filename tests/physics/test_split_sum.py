@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from unirender.composite import DIELECTRIC_F0, environment_brdf, fresnel, mean_fresnel
+from unirender.composite import DIELECTRIC_F0, fresnel
+from unirender.environment_brdf import environment_brdf, mean_fresnel
 from unirender_reference.backend import mitsuba
 
 SAMPLES = 1 << 16

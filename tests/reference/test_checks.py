@@ -9,7 +9,7 @@ import pytest
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError, UsageError
-from unirender_reference import effects, materials, scene
+from unirender_reference import effects, envmap, materials, scene, sensors
 from unirender_reference.backend import mitsuba
 from unirender_reference.checks import bsdf_checks
 from unirender_reference.checks.ball import ball, ball_view
@@ -17,6 +17,7 @@ from unirender_reference.checks.command import Check
 from unirender_reference.checks.outcome import against_truth, bounded
 from unirender_reference.checks.perturbations import PERTURBATIONS, perturbed
 from unirender_reference.checks.registry import CHECKS, run_check
+from unirender_reference.editable_scene import EditableScene
 from unirender_reference.passes import Estimate
 
 
@@ -109,8 +110,8 @@ def test_reflected_constant_light_is_the_weights_sum() -> None:
 
 @pytest.mark.parametrize("name", PERTURBATIONS)
 def test_perturbation_is_gone_after_its_block(name: str) -> None:
-    owners = (scene.EditableScene, "show"), (scene, "envmap_data"), (materials, "base_color_bitmap")
-    owners += (scene, "mesh_shape"), (mitsuba(), "render"), (scene, "sensor_dict")
+    owners = (EditableScene, "show"), (envmap, "envmap_data"), (materials, "base_color_bitmap")
+    owners += (scene, "mesh_shape"), (mitsuba(), "render"), (sensors, "sensor_dict")
     owners += ((effects, "interreflection_integrator"),)
     before = [getattr(owner, attribute) for owner, attribute in owners]
     with perturbed(name):

@@ -17,9 +17,10 @@ import pytest
 import unirender
 import unirender_reference
 from unirender.errors import UnirenderError
-from unirender_reference import cluster
+from unirender_reference import cluster, cluster_machine
 from unirender_reference.backend import VARIANT_VARIABLE
-from unirender_reference.cluster import ClusterExecutor, connect, this_machine
+from unirender_reference.cluster import ClusterExecutor, connect
+from unirender_reference.cluster_machine import this_machine
 from unirender_reference.dataset import generate
 from unirender_reference.dataset_config import DatasetConfig
 from unirender_reference.workers import WorkerDied
@@ -42,12 +43,12 @@ kill -- "-$1" 2> /dev/null
 def code(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Workers run a copy of the packages: those that start after somebody edited a file would rightly be refused."""
     folder = tmp_path_factory.mktemp("code")
-    digest = cluster._code_hash()
+    digest = cluster_machine._code_hash()
     for package in (unirender, unirender_reference):
         shutil.copytree(package.__path__[0], folder / package.__name__)
     this_machine.cache_clear()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cluster, "_code_hash", lambda: digest)
+        patch.setattr(cluster_machine, "_code_hash", lambda: digest)
         patch.syspath_prepend(folder)
         patch.setenv("PYTHONPATH", str(folder), prepend=os.pathsep)
         yield

@@ -22,7 +22,7 @@ from unirender.errors import UnirenderError
 from unirender.exr import write_exr
 from unirender.training.data.groups import list_shards
 from unirender_reference import journal, passes, shards
-from unirender_reference.cluster import this_machine
+from unirender_reference.cluster_machine import this_machine
 from unirender_reference.commands import Dataset
 from unirender_reference.dataset import generate, render_group
 from unirender_reference.dataset_config import DatasetConfig

@@ -275,3 +275,21 @@ def test_a_pool_without_turning_leaves_the_built_in_lights_alone(folder: Path) -
         same = np.array_equal(light.environment, turned.environment)
         assert same == (light.provenance["kind"] != "pool")
     assert len(kinds) > 1
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_the_gauge_keeps_pictures_between_black_and_white() -> None:
+    """Random objects, lights and materials; under lights four times as bright more of them is clipped."""
+    rng, shares = np.random.default_rng(1), []
+    for seed in range(5):
+        renderer = Renderer(make_object(seed, "train"), resolution=32)
+        for light in (make_light(3 * seed + i, "train").environment for i in range(3)):
+            lit = (light * scene_exposure(renderer, light, seed)).astype(np.float32)
+            image = renderer.image(lit, *rng.uniform(0, 1, 2), 32, batches=1).mean
+            inside = image[image[..., 3] > 0.5]
+            brightest = inside[:, :3].max(axis=1) / inside[:, 3]
+            shares.append([(brightest > 1).mean(), (4 * brightest > 1).mean(), (brightest < 0.001).mean()])
+    clipped, too_bright, black = np.median(shares, axis=0)
+    assert clipped < 0.05 < too_bright
+    assert black < 0.02

@@ -1,4 +1,4 @@
-"""`unirender lights` and `unirender reference exposure`: what they print and write."""
+"""`unirender lights`: what it prints and writes."""
 
 import json
 from pathlib import Path
@@ -13,7 +13,6 @@ from unirender.exr import on_pole_grid, read_exr
 from unirender.light.resampling import resample_environment
 from unirender_reference import lights
 from unirender_reference.lights.summary import light_row
-from unirender_reference.measure.exposure import Exposure, picture_exposure
 from unirender_reference.measure.lights import THUMBNAIL, Lights
 from unirender_reference.sheets import GAP, LINE, captioned_sheet, environment_preview, table_sheet
 
@@ -143,10 +142,8 @@ def test_a_draw_names_the_files_it_passed_over(tmp_path: Path, capsys: pytest.Ca
     assert all("bad.png" in failure["reason"] for failure in found["failures"])
 
 
-@pytest.mark.parametrize(
-    "command", [Lights(draw=(-1,)), Lights(holdout=1), Lights(share=0.0), Lights(share=1.5), Exposure(objects=0)]
-)
-def test_a_wrong_command_line(command: Lights | Exposure) -> None:
+@pytest.mark.parametrize("command", [Lights(draw=(-1,)), Lights(holdout=1), Lights(share=0.0), Lights(share=1.5)])
+def test_a_wrong_command_line(command: Lights) -> None:
     with pytest.raises(UsageError, match="expected"):
         command.run()
 
@@ -233,39 +230,3 @@ def test_captions_are_broken_between_words_not_cut() -> None:
     under = np.asarray(high)[-line:, : 80 + GAP]
     assert (under < 100).any()  # the last words stand there
     assert captioned_sheet([tile], ["w" * 99], 1).height == low.height  # one word has one line
-
-
-def test_tails_of_a_picture() -> None:
-    """8 covered pixels: 2 above white (one only in blue), 1 black, the others 0.5; edges do not count."""
-    image = np.zeros((3, 4, 4), np.float32)
-    image[:2, :, :3], image[:2, :, 3] = 0.5, 1
-    image[0, 0, :3] = 3
-    image[0, 1, 2] = 1.01
-    image[1, 0, :3] = 1e-4
-    image[2, :] = [9, 9, 9, 0.3]
-    image[1, 3] *= 0.6  # half covered: premultiplied
-    tails = picture_exposure(image, "a scene", "bundled", 0.5)
-    assert (tails.clipped, tails.black) == (2 / 8, 1 / 8)
-    assert tails.mean_srgb == pytest.approx((5 * 0.7354 + 1 + (2 * 0.7354 + 1) / 3 + 12.92e-4) / 8, abs=1e-3)
-
-
-@pytest.mark.long
-@pytest.mark.slow
-def test_the_gauge_keeps_pictures_between_black_and_white(capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
-    scenes = list(Exposure(objects=5, lights=3, spp=32, seed=1).scenes())
-    assert len(scenes) == 15
-    assert np.median([scene.clipped for scene in scenes]) < 0.05
-    assert np.median([scene.black for scene in scenes]) < 0.02
-    assert 0.15 < np.median([scene.mean_srgb for scene in scenes]) < 0.6
-    monkeypatch.setenv("COLUMNS", "200")
-    assert Exposure(objects=1, lights=2, spp=16).run() == 0
-    assert "2 scenes" in capsys.readouterr().out
-
-
-def test_twin_a_light_four_times_as_bright_is_found_clipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    from unirender_reference import exposure
-
-    right = exposure.scene_exposure
-    monkeypatch.setattr(exposure, "scene_exposure", lambda *arguments: 4 * right(*arguments))
-    scenes = list(Exposure(objects=2, lights=3, spp=32, seed=1).scenes())
-    assert np.median([scene.clipped for scene in scenes]) > 0.05

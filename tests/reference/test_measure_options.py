@@ -10,7 +10,6 @@ from unirender_reference.checks.command import Check
 from unirender_reference.measure.census_command import Census
 from unirender_reference.measure.contact_sheet import Sheet
 from unirender_reference.measure.cost import Cost
-from unirender_reference.measure.exposure import Exposure
 from unirender_reference.measure.noise_floor import NoiseFloor
 from unirender_reference.measure.passes import Passes
 from unirender_reference.measure.shade_ceiling import ShadeCeiling
@@ -30,8 +29,6 @@ OUT = {"out": Path("never_written.png")}
         (NoiseFloor, {"factor": 0}, "--factor 0: expected 1 or more"),
         (NoiseFloor, {"workers": -1}, "--workers -1: expected 0 or more"),
         (NoiseFloor, {"floor": 0.0}, "--floor 0: expected decibels above 0 and below 100"),
-        (Exposure, {"lights": 0}, "--lights 0: expected 1 or more"),
-        (Exposure, {"seed": -1}, "--seed -1: expected 0 or more"),
         (Cost, {"resolutions": ()}, "--resolutions : expected one or more, each of 1 pixel or more"),
         (Cost, {"resolutions": (64, 0)}, "--resolutions 64 0: expected one or more, each of 1 pixel or more"),
         (Cost, {"scenes": 0}, "--scenes 0: expected 1 or more"),

@@ -23,8 +23,9 @@ from unirender_reference.noise import (
     noise_floor_db,
     render_to_floor,
 )
-from unirender_reference.passes import SAMPLES_PER_PASS, Estimate, pass_count
+from unirender_reference.passes import Estimate
 from unirender_reference.render import Renderer
+from unirender_reference.sample_counts import SAMPLES_PER_PASS, pass_count
 
 SHAPE = (64, 64, 3)
 WHOLE = np.ones((64, 64, 1), np.float32)

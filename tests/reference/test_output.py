@@ -13,8 +13,8 @@ from unirender_reference.checks.command import Check
 from unirender_reference.measure.census_command import Census
 from unirender_reference.measure.contact_sheet import Sheet
 from unirender_reference.measure.lights import Lights
-from unirender_reference.measure.output import check_file, write_file
 from unirender_reference.measure.passes import Passes
+from unirender_reference.output_files import check_file, write_file
 
 NO_SPACE = "No space left on device"
 

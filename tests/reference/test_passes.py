@@ -10,11 +10,10 @@ import reference_scenes as scenes
 
 from unirender.errors import UnirenderError
 from unirender_reference import passes as module
+from unirender_reference import sample_counts
 from unirender_reference.backend import mitsuba
 from unirender_reference.integrators import path_integrator, python_integrator
 from unirender_reference.passes import (
-    MOST_KEPT,
-    MOST_SPLITS,
     NAN_ATTEMPTS,
     PIXELS_PER_BLOCK,
     Counters,
@@ -22,15 +21,13 @@ from unirender_reference.passes import (
     finite_pass,
     group_means,
     integrator_passes,
-    kept_passes,
     mean_estimate,
-    next_spp,
-    pass_count,
     ratio_estimate,
     render_passes,
     weighted_estimate,
 )
 from unirender_reference.render import Renderer
+from unirender_reference.sample_counts import MOST_KEPT, MOST_SPLITS, kept_passes, next_spp, pass_count
 
 SIZE = 24
 SPP, BATCHES = 64, 4
@@ -219,7 +216,7 @@ def test_more_passes_than_anybody_waits_for_are_refused_at_once() -> None:
     """Finding how to divide them would take as long."""
     with pytest.raises(UnirenderError, match=r"spp: got 1\d+, expected at most 64,000,000, "):
         pass_count(10**20, 1, 64)
-    assert pass_count(64 * module.MOST_PASSES, 1, 64) == module.MOST_PASSES
+    assert pass_count(64 * sample_counts.MOST_PASSES, 1, 64) == sample_counts.MOST_PASSES
 
 
 def test_groups_are_means_of_successive_passes() -> None:
@@ -268,7 +265,7 @@ def test_memory_does_not_grow_with_the_samples(scene, monkeypatch: pytest.Monkey
 def test_grouped_passes_are_those_of_the_same_seeds(scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "SAMPLES_PER_PASS", SIZE**2)
     grouped, _ = render_passes(scene, 2, 64, 7, BATCHES, Counters())
-    monkeypatch.setattr(module, "MOST_KEPT", 64)
+    monkeypatch.setattr(sample_counts, "MOST_KEPT", 64)
     single, _ = render_passes(scene, 2, 64, 7, BATCHES, Counters())
     assert (len(grouped), len(single)) == (MOST_KEPT, 64)
     pairs = np.stack(single).reshape(MOST_KEPT, 2, *single[0].shape)

@@ -8,9 +8,9 @@ import torch
 from unirender.light.environment import environment_directions, sample_environment, texel_solid_angles
 from unirender.light.for_mitsuba import has_bright_pole
 from unirender_reference import principled
+from unirender_reference.envmap import envmap_data, envmap_rows
 from unirender_reference.lights import bundled_lights, make_light
 from unirender_reference.render import Renderer
-from unirender_reference.scene import envmap_data, envmap_rows
 from unirender_reference.shade import shade, shade_gradients
 
 SIZE, SPP = 24, 1024

@@ -12,7 +12,8 @@ from scipy.stats import chi2
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender_reference import backend, materials, passes, scene
+from unirender_reference import backend, editable_scene, materials, passes, sample_counts, scene
+from unirender_reference.envmap import MOST_RADIANCE, envmap_data
 from unirender_reference.lights import Light
 from unirender_reference.multiview import orbit, pose_towards
 from unirender_reference.render import (
@@ -25,7 +26,7 @@ from unirender_reference.render import (
     scene_hash,
     scene_hashes,
 )
-from unirender_reference.scene import MOST_RADIANCE, envmap_data, sensor_at, sensor_dict
+from unirender_reference.sensors import sensor_at, sensor_dict
 from unirender_reference.shapes import bounding_sphere
 
 SIZE = 32
@@ -141,7 +142,7 @@ def test_all_buffers_share_one_scene(renderer: Renderer, monkeypatch: pytest.Mon
     """Loading builds an acceleration structure: once for an object, whatever is rendered of it."""
     loaded = []
     genuine = scene.load_scene
-    monkeypatch.setattr(scene, "load_scene", lambda *args: loaded.append(args) or genuine(*args))
+    monkeypatch.setattr(editable_scene, "load_scene", lambda *args: loaded.append(args) or genuine(*args))
     light = scenes.environment()
     renderer.geometry(16)
     for environment in (light, 2 * light):
@@ -386,7 +387,7 @@ def test_the_hash_does_not_depend_on_the_type_of_a_number() -> None:
 @pytest.mark.parametrize("spp", [67, 704])
 def test_geometry_takes_the_next_full_grid(renderer: Renderer, spp: int) -> None:
     """Any number of samples that an image takes: 704 in 8 batches are 11 passes of 64, but no full grid in one."""
-    taken = passes.next_spp(spp, 1, passes.SAMPLES_PER_PASS // SIZE**2)
+    taken = sample_counts.next_spp(spp, 1, sample_counts.SAMPLES_PER_PASS // SIZE**2)
     assert spp < taken < 1.1 * spp
     for name, picture in renderer.geometry(spp, 1).require("mask", "normal", "albedo").items():
         np.testing.assert_array_equal(picture, renderer.geometry(taken, 1).require(name)[name])

@@ -11,16 +11,13 @@ import pytest
 import torch
 
 from unirender.camera import Camera
-from unirender.composite import (
+from unirender.composite import composite, composite_image, fresnel, split_sum_image
+from unirender.environment_brdf import (
     TABLES,
-    composite,
-    composite_image,
     environment_brdf,
     environment_brdf_tables,
-    fresnel,
     integrate_environment_brdf,
     mean_fresnel,
-    split_sum_image,
 )
 from unirender.errors import UnirenderError
 from unirender.intrinsics import Intrinsics

@@ -80,9 +80,9 @@ class BenchPublic:
         from rich.console import Console
 
         from unirender_evaluation.predictions.check import PredictionError
+        from unirender_evaluation.public.files import PublicSetError
         from unirender_evaluation.public.rows import public_rows
         from unirender_evaluation.public.run import PublicRun, run
-        from unirender_evaluation.public.sets import PublicSetError
         from unirender_evaluation.runs.command import named_folders
 
         public = self.reader()

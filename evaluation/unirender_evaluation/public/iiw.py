@@ -15,9 +15,10 @@ from pathlib import Path
 from unirender.errors import UnirenderError
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.metrics import Variant, metric_key
+from unirender_evaluation.public.files import PublicSetError, missing_files, need_folder, parsed_json
 from unirender_evaluation.public.metrics import DELTA, WHDR, Judgement, judgements, whdr
 from unirender_evaluation.public.scenes import Scenes, scene_sample
-from unirender_evaluation.public.sets import Answer, PublicSetError, Sample, missing_files, need_folder, parsed_json
+from unirender_evaluation.public.sets import Answer, Sample
 from unirender_evaluation.tables.specs import Column, TableSpec
 
 NAME = "iiw"
@@ -31,7 +32,7 @@ class Iiw(Scenes):
     tables: tuple[TableSpec, ...] = (
         TableSpec(NAME, "IIW", (Column("Albedo", "albedo", WHDR, published=False),), ("single-image",)),
     )
-    modules: tuple[str, ...] = ("public/iiw", "public/metrics", "public/scenes", "public/sets")
+    modules: tuple[str, ...] = ("public/iiw", "public/files", "public/metrics", "public/scenes", "public/sets")
     variant = Variant("whole")
 
     def samples(self) -> tuple[Sample, ...]:

@@ -25,9 +25,10 @@ from unirender.errors import UnirenderError
 from unirender_evaluation.lpips import Lpips
 from unirender_evaluation.methods.suspicions import suspicions_of_maps
 from unirender_evaluation.metrics import Variant, metric_key
+from unirender_evaluation.public.files import PublicSetError, missing_files, need_folder
 from unirender_evaluation.public.metrics import CHROMATICITY, INTENSITY, chromaticity, intensity, segment_means
 from unirender_evaluation.public.scenes import Scenes, scene_sample
-from unirender_evaluation.public.sets import Answer, PublicSetError, Sample, missing_files, need_folder
+from unirender_evaluation.public.sets import Answer, Sample
 from unirender_evaluation.tables.specs import Column, TableSpec
 
 NAME = "maw"
@@ -53,7 +54,7 @@ class Maw(Scenes):
             ("single-image",),
         ),
     )
-    modules: tuple[str, ...] = ("public/maw", "public/metrics", "public/scenes", "public/sets")
+    modules: tuple[str, ...] = ("public/maw", "public/files", "public/metrics", "public/scenes", "public/sets")
     variant = Variant("whole")
 
     def samples(self) -> tuple[Sample, ...]:

@@ -29,36 +29,22 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.camera import Camera
-from unirender.color import srgb_decode
 from unirender.errors import UnirenderError
-from unirender.exr import channels_rgb, read_exr
 from unirender_evaluation.lpips import Lpips
-from unirender_evaluation.methods.method import quantise
 from unirender_evaluation.methods.suspicions import suspicions_of_maps
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.public import orb_scoring as scoring
+from unirender_evaluation.public.files import PublicSetError, missing_files, need_folder
 from unirender_evaluation.public.metrics import ERODED, eroded
+from unirender_evaluation.public.orb_files import OrbFiles, frame_truths, light_file
 from unirender_evaluation.public.orb_frames import HDR, LDR, Capture, Photograph, captures, relightings
-from unirender_evaluation.public.sets import (
-    MAPS,
-    Answer,
-    PublicSetError,
-    Sample,
-    block_mean,
-    missing_files,
-    need_folder,
-    read_array,
-    read_display,
-    read_photograph,
-)
+from unirender_evaluation.public.sets import MAPS, Answer, Sample
 from unirender_evaluation.tables.specs import TableSpec
 
 NAME = "stanford-orb"
 RESOLUTION = 512  # of the benchmark
 TOLERANCE_DEG = 2.0
 LAYOUT = "Stanford-ORB's folders blender_LDR, ground_truth and, for relighting, blender_HDR"
-MAP_TRUTHS = {"normal": ("surface_normal", (".npy",)), "depth": ("z_depth", (".npy",)),
-              "albedo": ("pseudo_gt_albedo", (".png", ".npy"))}  # fmt: skip
 
 
 class StanfordOrb:
@@ -72,12 +58,13 @@ class StanfordOrb:
 
     name = NAME
     tables: tuple[TableSpec, ...] = (scoring.MAPS_TABLE, scoring.RELIT_TABLE)
-    modules: tuple[str, ...] = ("public/orb*", "public/metrics", "public/sets")
+    modules: tuple[str, ...] = ("public/orb*", "public/files", "public/metrics", "public/sets")
     variant = Variant("masked")
     averaged_first: str | None = "captures"
 
     def __init__(self, folder: Path, resolution: int = RESOLUTION, tolerance_deg: float = TOLERANCE_DEG) -> None:
         self.folder, self.resolution, self.tolerance_deg = folder, resolution, tolerance_deg
+        self._files = OrbFiles(folder, resolution)
 
     @cached_property
     def _captures(self) -> list[Capture]:
@@ -141,7 +128,7 @@ class StanfordOrb:
         return Sample(scoring.MAPS_TABLE.name, key, capture.object, "decompose", key, MAPS, files)
 
     def _relight_sample(self, key: str, source: Photograph | None, frame: Photograph, capture: Capture) -> Sample:
-        light = frame.truth(self.folder, "env_map", ".exr")
+        light = light_file(self.folder, frame)
         sees = source is not None and light.parent.is_dir()
         files = [frame.photo(self.folder, HDR), frame.mask(self.folder), *capture.files]
         if source is not None and sees:
@@ -156,19 +143,11 @@ class StanfordOrb:
         frame = self._tests[sample.key] if sample.asks == "decompose" else self._relit[sample.key][0]
         if frame is None:
             raise UnirenderError(f"{sample.key}: no photograph was taken from the camera of the relit one")
-        mask = self._mask(frame)
-        path = frame.photo(self.folder)
-        linear = srgb_decode(read_photograph(path))
-        full = read_display(frame.mask(self.folder), 1)
-        if full.shape[:2] != linear.shape[:2]:
-            raise UnirenderError(
-                f"{frame.mask(self.folder)}: is {_size(full)} pixels, expected {_size(linear)} as its photograph {path}"
-            )
-        picture = quantise(block_mean(linear * full, self.resolution, str(path)), mask)
+        mask = self._files.mask(frame)
+        picture = self._files.picture(frame, mask)
         found: dict[str, Any] = {"image_srgb": picture, "mask": mask, "camera": frame.camera(*mask.shape[:2])}
         if sample.asks == "relight":
-            light = self._relit[sample.key][1].truth(self.folder, "env_map", ".exr")
-            found["environment"] = contract_environment(read_radiance(light))
+            found["environment"] = self._files.light(self._relit[sample.key][1])
         return found
 
     def frame(self, sample: Sample) -> tuple[tuple[int, int], Camera]:
@@ -194,48 +173,10 @@ class StanfordOrb:
         """The mask of a sample, and what its answer is compared with."""
         if sample.asks == "relight":
             frame = self._relit[sample.key][1]
-            path = frame.photo(self.folder, HDR)
-            return self._mask(frame), {"relit": self._reduced(read_radiance(path), path, frame)}
+            return self._files.mask(frame), {"relit": self._files.relit(frame)}
         frame = self._tests[sample.key]
-        mask = self._mask(frame)
-        found = frame_truths(self.folder, frame)
-        return mask, {name: self._truth(name, path, frame, eroded(mask)) for name, path in found.items()}
-
-    def _mask(self, frame: Photograph) -> Float[np.ndarray, "h w 1"]:
-        path = frame.mask(self.folder)
-        full = read_display(path, 1)
-        if full.shape[0] != full.shape[1]:
-            raise UnirenderError(f"{path}: is {_size(full)} pixels, expected a square, as all pictures of the set are")
-        mask = block_mean(full, self.resolution, str(path))
-        if not eroded(mask).any():
-            raise UnirenderError(
-                f"{path}: shows no object larger than its edge, which is left out, at {self.resolution} pixels, "
-                "expected white on the object; check the file, or pass a larger --resolution"
-            )
-        return mask
-
-    def _reduced(
-        self, value: Float[np.ndarray, "h w c"], path: Path, frame: Photograph
-    ) -> Float[np.ndarray, "h2 w2 c"]:
-        """A map at the run's resolution, which has to be a square like the mask of its frame."""
-        if value.shape[0] != value.shape[1]:
-            raise UnirenderError(
-                f"{path}: is {_size(value)} pixels, expected a square like its mask {frame.mask(self.folder)}"
-            )
-        return block_mean(value, self.resolution, str(path))
-
-    def _truth(
-        self, name: str, path: Path, frame: Photograph, counted: Float[np.ndarray, "h w 1"]
-    ) -> Float[np.ndarray, "h w c"]:
-        """A map of the truth, with a look at the values that count: those of the eroded mask."""
-        if path.suffix == ".png":
-            return srgb_decode(self._reduced(read_display(path, 3), path, frame))
-        full = read_array(path, 1 if name == "depth" else 3)
-        found = self._reduced(full, path, frame)
-        block = len(full) // len(found)  # means of unit vectors are shorter: what is stored is looked at
-        inside = np.kron(counted[..., 0] > 0, np.ones((block, block), bool))
-        scoring.check_truth(name, full[: len(inside), : len(inside)][inside], str(path))
-        return found
+        mask = self._files.mask(frame)
+        return mask, self._files.maps(frame, mask)
 
     def why_absent(self, table: str) -> str | None:
         """How many photographs could be relit by a method, where it is none."""
@@ -270,49 +211,5 @@ class StanfordOrb:
         )
 
 
-def _size(value: Float[np.ndarray, "h w c"]) -> str:
-    return f"{value.shape[1]} x {value.shape[0]}"
-
-
 def _relight_name(frame: Photograph) -> str:
     return f"relight_{frame.capture}_{frame.id}"
-
-
-def frame_truths(folder: Path, frame: Photograph) -> dict[str, Path]:
-    """The truths of a photograph whose folder is there, by map; a file may still be missing in it."""
-    found = {}
-    for name, (kind, suffixes) in MAP_TRUTHS.items():
-        paths = [frame.truth(folder, kind, suffix) for suffix in suffixes]
-        if paths[0].parent.is_dir():
-            found[name] = next((path for path in paths if path.is_file()), paths[0])
-    return found
-
-
-def read_radiance(path: Path) -> Float[np.ndarray, "h w 3"]:
-    """R, G, B of an EXR file, negative values as 0 (the benchmark does the same).
-
-    Raises:
-        UnirenderError: no readable file, no such channels, or values that are not finite.
-    """
-    try:
-        rgb = channels_rgb(read_exr(path)[0])
-    except UnirenderError as error:
-        raise UnirenderError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
-    if not np.isfinite(rgb).all():
-        bad = int((~np.isfinite(rgb)).any(axis=-1).sum())
-        raise UnirenderError(f"{path}: {bad} pixels are NaN or infinite, expected finite radiance; repair them first")
-    return np.maximum(rgb, 0)
-
-
-def contract_environment(stored: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """An env_map on the contract's grid.
-
-    Both have +y up and rows on the poles. There the middle column looks along -z, into the scene, and the first and
-    last column, both behind the camera, are one direction; here -z is at the border, and columns are centres.
-    """
-    width = stored.shape[1]
-    turn = (np.arange(width) + 0.5) / width  # of the contract's columns, from -z over +x
-    position = np.mod(turn + 0.5, 1.0) * (width - 1)
-    first = np.minimum(position.astype(np.int64), width - 2)
-    share = (position - first)[:, None]
-    return (stored[:, first] * (1 - share) + stored[:, first + 1] * share).astype(np.float32)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.errors import UnirenderError
-from unirender_evaluation.public.sets import parsed_json
+from unirender_evaluation.public.files import parsed_json
 
 LDR, HDR, TRUTH = "blender_LDR", "blender_HDR", "ground_truth"
 ROTATION_TOLERANCE = 1e-3

@@ -7,7 +7,8 @@ import numpy as np
 
 from unirender.camera import DEFAULT_FOV_DEG, Camera
 from unirender.color import image_srgb, srgb_decode
-from unirender_evaluation.public.sets import MAPS, Sample, image_size, read_photograph, shrunk
+from unirender_evaluation.public.files import image_size, read_photograph, shrunk
+from unirender_evaluation.public.sets import MAPS, Sample
 
 RESOLUTION = 512
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from unirender.camera import Camera
 from unirender.light.environment import sample_environment
-from unirender_reference import materials, scene
+from unirender_reference import materials, scene, sensors
 from unirender_reference.backend import mitsuba
 from unirender_reference.checks.ball import ALBEDO, ball, ball_view
 from unirender_reference.checks.outcome import BATCHES, Check, against_truth
@@ -53,7 +53,7 @@ def lambert_directional(seed: int) -> Check:
     mi = mitsuba()
     parts: dict[str, Any] = {
         "type": "scene",
-        "sensor": scene.sensor_dict(Camera(), SIZE, SIZE),
+        "sensor": sensors.sensor_dict(Camera(), SIZE, SIZE),
         "light": {"type": "directional", "direction": list(-SUN), "irradiance": {"type": "rgb", "value": IRRADIANCE}},
         "object": scene.mesh_shape(ball(), _lambertian()),
     }

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from unirender.errors import UsageError
 from unirender.system.wording import one_of
-from unirender_reference.measure.output import check_file, write_file
 from unirender_reference.option_checks import require_least
+from unirender_reference.output_files import check_file, write_file
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -23,8 +23,9 @@ import numpy as np
 
 from unirender.color import srgb_encode
 from unirender.errors import UnirenderError
-from unirender_reference import effects, materials, scene
+from unirender_reference import effects, envmap, materials, scene, sensors
 from unirender_reference.backend import mitsuba
+from unirender_reference.editable_scene import EditableScene
 from unirender_reference.render import DIRECT_DEPTH
 
 MORE_ROUGHNESS = 1.12
@@ -66,7 +67,7 @@ def _roughness() -> Patch:
 
         return wrong
 
-    return scene.EditableScene, "show", changed
+    return EditableScene, "show", changed
 
 
 def _light_texel() -> Patch:
@@ -77,11 +78,11 @@ def _light_texel() -> Patch:
 
         return wrong
 
-    return scene.EditableScene, "show", changed
+    return EditableScene, "show", changed
 
 
 def _unwrapped() -> Patch:
-    return scene, "envmap_data", lambda right: lambda environment: right(environment)[:, 1:-1]
+    return envmap, "envmap_data", lambda right: lambda environment: right(environment)[:, 1:-1]
 
 
 def _albedo() -> Patch:
@@ -121,7 +122,7 @@ def _fov() -> Patch:
 
         return wrong
 
-    return scene, "sensor_dict", changed
+    return sensors, "sensor_dict", changed
 
 
 def _metallic() -> Patch:
@@ -134,7 +135,7 @@ def _metallic() -> Patch:
 
         return wrong
 
-    return scene.EditableScene, "show", changed
+    return EditableScene, "show", changed
 
 
 def _bounces() -> Patch:

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from unirender_reference.measure.output import check_file, write_file
 from unirender_reference.option_checks import require_least
+from unirender_reference.output_files import check_file, write_file
 
 if TYPE_CHECKING:
     from unirender_reference.measure.census import BadPixel, ObjectCensus

@@ -9,7 +9,6 @@ from unirender_reference.checks.command import Check
 from unirender_reference.measure.census_command import Census
 from unirender_reference.measure.contact_sheet import Sheet
 from unirender_reference.measure.cost import Cost
-from unirender_reference.measure.exposure import Exposure
 from unirender_reference.measure.noise_floor import NoiseFloor
 from unirender_reference.measure.passes import Passes
 from unirender_reference.measure.shade_ceiling import ShadeCeiling
@@ -28,7 +27,6 @@ class Reference:
         | Annotated[Passes, tyro.conf.subcommand("passes")]
         | Annotated[ShadeCeiling, tyro.conf.subcommand("shade-ceiling")]
         | Annotated[Cost, tyro.conf.subcommand("cost")]
-        | Annotated[Exposure, tyro.conf.subcommand("exposure")]
         | Annotated[Sheet, tyro.conf.subcommand("sheet")]
     ] = field()
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from unirender.errors import UsageError
 from unirender.system.wording import counted
-from unirender_reference.measure.output import check_file, png_bytes, write_file
 from unirender_reference.option_checks import require_least
+from unirender_reference.output_files import check_file, png_bytes, write_file
 
 if TYPE_CHECKING:
     import numpy as np

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from unirender.errors import UnirenderError, UsageError
 from unirender.system.wording import counted
 from unirender.system.writing import writing
-from unirender_reference.measure.output import ELSEWHERE, check_file, png_bytes, write_file
+from unirender_reference.output_files import ELSEWHERE, check_file, png_bytes, write_file
 
 if TYPE_CHECKING:
     from PIL import Image

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from unirender.errors import UnirenderError, UsageError
 from unirender.system.writing import writing
-from unirender_reference.measure.output import ELSEWHERE
 from unirender_reference.option_checks import require_least
+from unirender_reference.output_files import ELSEWHERE
 
 if TYPE_CHECKING:
     import numpy as np

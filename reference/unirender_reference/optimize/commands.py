@@ -13,11 +13,11 @@ import tyro
 from unirender.errors import UnirenderError, UsageError
 from unirender.system.wording import counted
 from unirender.system.writing import writing
-from unirender_reference.measure.output import ELSEWHERE, full_disk
 from unirender_reference.optimize.machine import require_cores
 from unirender_reference.optimize.multiview.config import OptimizeConfig
 from unirender_reference.optimize.single.config import SingleConfig, kept_note
 from unirender_reference.option_checks import require_least
+from unirender_reference.output_files import ELSEWHERE, full_disk
 
 if TYPE_CHECKING:
     import numpy as np

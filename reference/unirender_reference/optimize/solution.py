@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from unirender.errors import UnirenderError
 from unirender.shown import short_repr
-from unirender_reference.scene import envmap_data
+from unirender_reference.envmap import envmap_data
 from unirender_reference.shapes import MeshObject
 
 

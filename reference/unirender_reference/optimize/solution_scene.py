@@ -12,7 +12,8 @@ from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.views import View
 from unirender_reference.passes import Counters, derive_seed, mean_estimate, render_passes
 from unirender_reference.render import IMAGE_DEPTH
-from unirender_reference.scene import object_scene, sensor_at
+from unirender_reference.scene import object_scene
+from unirender_reference.sensors import sensor_at
 
 
 def solution_scene(solution: Solution) -> Any:
@@ -32,7 +33,7 @@ def solution_images(solution: Solution, views: Sequence[View], spp: int, seed: i
     Args:
         solution: what is shown.
         views: cameras; all pictures have one size.
-        spp: samples per pixel (`passes.pass_count` says which numbers serve).
+        spp: samples per pixel (`sample_counts.pass_count` says which numbers serve).
         seed: equal seeds give equal pictures.
     """
     scene, images = solution_scene(solution), []

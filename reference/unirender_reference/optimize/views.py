@@ -11,7 +11,7 @@ from unirender.errors import UnirenderError
 from unirender.intrinsics import as_numbers
 from unirender.pictures import DISPLAY_WHITE
 from unirender.shown import short_repr
-from unirender_reference.scene import check_pose
+from unirender_reference.sensors import check_pose
 
 RANGE_TOLERANCE = 1e-3
 BLACK = 0.5 / 255  # display values of 8 bits below are 0

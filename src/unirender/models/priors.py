@@ -16,7 +16,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from unirender.camera import Camera
-from unirender.composite import composite, composite_image, environment_brdf_tables, fresnel, lobes, split_sum_image
+from unirender.composite import composite, composite_image, fresnel, lobes, split_sum_image
+from unirender.environment_brdf import environment_brdf_tables
 from unirender.intrinsics import Intrinsics
 from unirender.models.packing import Maps
 
@@ -61,7 +62,7 @@ PRIORS = {
 
 
 def _environment_brdf(n_v: Float[Tensor, "b 1 H W"], roughness: Float[Tensor, "b 1 H W"]) -> Float[Tensor, "b 2 H W"]:
-    """Torch twin of `unirender.composite.environment_brdf`: A and B, bilinear in the same tables."""
+    """Torch twin of `unirender.environment_brdf.environment_brdf`: A and B, bilinear in the same tables."""
     tables = _tables().to(n_v).expand(len(n_v), -1, -1, -1)
     at = torch.cat([roughness, n_v], dim=1).permute(0, 2, 3, 1)  # grid_sample: x runs along the last axis
     return F.grid_sample(tables, 2 * at - 1, mode="bilinear", padding_mode="border", align_corners=True)

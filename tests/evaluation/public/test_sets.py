@@ -1,8 +1,10 @@
 """Readers of public test sets, on tiny folders in their authors' layouts: what they hand out, and broken folders."""
 
+import ast
 import json
 import shutil
 from collections.abc import Callable
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +20,15 @@ from unirender.exr import image_channels, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender.light.environment import environment_directions, sample_environment
 from unirender_evaluation.metrics import Variant, metric_key
+from unirender_evaluation.public.files import PublicSetError, block_mean, shrunk
 from unirender_evaluation.public.iiw import Iiw
 from unirender_evaluation.public.maw import Maw, adobe_to_rec709, measured
 from unirender_evaluation.public.metrics import COSINE_DISTANCE, PSNR_H, PSNR_L
-from unirender_evaluation.public.orb import StanfordOrb, contract_environment
+from unirender_evaluation.public.orb import StanfordOrb
+from unirender_evaluation.public.orb_files import contract_environment
 from unirender_evaluation.public.orb_frames import Capture, Photograph, captures, difference_deg, object_of
-from unirender_evaluation.public.sets import Answer, PublicSet, PublicSetError, block_mean, shrunk
+from unirender_evaluation.public.sets import Answer, PublicSet
+from unirender_evaluation.versions import package_folder
 
 
 @pytest.fixture
@@ -472,3 +477,20 @@ def test_channels_of_radiance_are_read_as_they_are(orb: StanfordOrb) -> None:
         sample_of(orb, "cup_scene001/relight_cup_scene002_0000"), Answer(image=np.zeros((32, 32, 3), np.float32)), ()
     )
     assert found[metric_key("relit", PSNR_L, Variant(scale="raw"))] == np.inf  # negative radiance is black
+
+
+@pytest.mark.parametrize("reader", [StanfordOrb, Iiw, Maw])
+def test_a_record_follows_all_that_its_set_is_read_and_scored_with(reader: type[PublicSet]) -> None:
+    room = package_folder("unirender_evaluation")
+    found, left = set(), [reader.__module__]
+    while left:
+        path = Path(*left.pop().split(".")[1:]).as_posix()
+        if path in found or not path.startswith("public/"):
+            continue
+        found.add(path)
+        for line in ast.walk(ast.parse((room / f"{path}.py").read_text(encoding="utf-8"))):
+            if isinstance(line, ast.ImportFrom) and line.module:
+                whole = line.module.endswith(".public")
+                left += [f"{line.module}.{alias.name}" for alias in line.names] if whole else [line.module]
+    assert len(found) > 2
+    assert not [path for path in found if not any(fnmatch(path, pattern) for pattern in reader.modules)]

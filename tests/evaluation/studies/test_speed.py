@@ -46,7 +46,7 @@ from unirender_evaluation.studies.speed.timing import Part, Timing, medians, tim
 from unirender_evaluation.studies.speed.training import throughput, training_table
 from unirender_evaluation.suites.suite import Suite
 from unirender_evaluation.tables.text import TextTable
-from unirender_reference.passes import SAMPLES_PER_PASS, pass_count
+from unirender_reference.sample_counts import SAMPLES_PER_PASS, pass_count
 
 CPU = torch.device("cpu")
 PLAIN = dataclasses.replace(TRAIN, model=dataclasses.replace(TRAIN.model, physics_prior="none"))

@@ -19,12 +19,13 @@ from unirender.light.environment import environment_directions, sample_environme
 from unirender.light.for_mitsuba import middle_rows
 from unirender.light.resampling import area_pixels
 from unirender_reference.backend import mitsuba
+from unirender_reference.envmap import envmap_data
 from unirender_reference.lights import load_light
 from unirender_reference.meshes import load_mesh, load_mesh_placed
 from unirender_reference.optimize.files.export import FINER, write_solution
 from unirender_reference.optimize.files.glb import glb_bytes, texture_pixels
 from unirender_reference.optimize.solution import Solution
-from unirender_reference.scene import envmap_data, sensor_dict
+from unirender_reference.sensors import sensor_dict
 from unirender_reference.shapes import MeshObject, Sphere
 
 

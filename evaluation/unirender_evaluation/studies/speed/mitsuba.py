@@ -95,7 +95,7 @@ def fewest_samples(
 
 def is_sample_count(spp: int, resolution: int) -> bool:
     """Whether a picture of that many pixels a side can be rendered with so many samples per pixel in one batch."""
-    from unirender_reference.passes import SAMPLES_PER_PASS, next_spp
+    from unirender_reference.sample_counts import SAMPLES_PER_PASS, next_spp
 
     return next_spp(spp, 1, SAMPLES_PER_PASS // resolution**2) == spp
 

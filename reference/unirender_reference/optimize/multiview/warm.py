@@ -22,7 +22,8 @@ from unirender_reference.optimize.shape.uv import charted
 from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.surface.textures import texel_weights
 from unirender_reference.optimize.views import View, Views
-from unirender_reference.scene import object_scene, sensor_at
+from unirender_reference.scene import object_scene
+from unirender_reference.sensors import sensor_at
 from unirender_reference.shapes import MeshObject
 
 LEAST_RADIANCE = 1e-4  # of the start's light: logarithms of it are refined

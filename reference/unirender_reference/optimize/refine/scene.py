@@ -24,7 +24,8 @@ from unirender_reference.optimize.solution import Solution
 from unirender_reference.optimize.solution_scene import solution_scene
 from unirender_reference.optimize.views import View
 from unirender_reference.passes import NAN_ATTEMPTS, Counters, derive_seed, finite_pass
-from unirender_reference.scene import LIGHT, parameter_name, sensor_at
+from unirender_reference.scene import LIGHT, parameter_name
+from unirender_reference.sensors import sensor_at
 from unirender_reference.shader import MOST_METALLIC, gradient, tensors, wrapped
 
 Maps = Mapping[str, Float[np.ndarray, "..."]]

@@ -14,7 +14,8 @@ from unirender_reference.backend import mitsuba
 from unirender_reference.optimize.views import View
 from unirender_reference.passes import derive_seed
 from unirender_reference.samplers import stratified_sampler
-from unirender_reference.scene import object_scene, sensor_at, sensor_dict
+from unirender_reference.scene import object_scene
+from unirender_reference.sensors import sensor_at, sensor_dict
 from unirender_reference.shader import facing
 from unirender_reference.shapes import MeshObject
 

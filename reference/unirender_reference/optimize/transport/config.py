@@ -48,7 +48,7 @@ class TransportConfig:
         Raises:
             UsageError: one is outside its range.
         """
-        from unirender_reference.passes import SAMPLES_PER_PASS, pass_count
+        from unirender_reference.sample_counts import SAMPLES_PER_PASS, pass_count
 
         counts = {"pixels": LEAST_PIXELS, "fine_pixels": LEAST_PIXELS, "iterations": 0, "rounds": 0}
         weights = {"fine_below": 0, "smooth_light": 0, "neutral_light": 0, "smooth_albedo": 0}

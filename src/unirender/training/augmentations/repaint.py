@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from unirender.camera import Camera
-from unirender.composite import environment_brdf
+from unirender.environment_brdf import environment_brdf
 from unirender.light.symmetries import Maps
 
 CHANNEL_RANGE = (0.02, 0.98)  # of an object's mean colour: a power takes neither 0 nor 1 elsewhere

@@ -15,9 +15,7 @@ from pathlib import Path
 from unirender.arguments import as_path
 from unirender.errors import UnirenderError
 from unirender_evaluation.claims import OPTIMISED, OPTIMISED_ON_MESH, OURS, REFINED
-from unirender_evaluation.results.data import Results
-from unirender_evaluation.results.file import read_results
-from unirender_evaluation.results.findings import (
+from unirender_evaluation.pages.findings import (
     NOT_RUN,
     Question,
     answers,
@@ -27,8 +25,8 @@ from unirender_evaluation.results.findings import (
     sure_of,
     together,
 )
-from unirender_evaluation.results.groups import by_kind, by_material, by_object, by_scale
-from unirender_evaluation.results.questions import (
+from unirender_evaluation.pages.groups import by_kind, by_material, by_object, by_scale
+from unirender_evaluation.pages.questions import (
     BOTH_SIZES,
     BY_KIND,
     BY_TARGET,
@@ -40,6 +38,8 @@ from unirender_evaluation.results.questions import (
     STANDARD,
     TARGETS,
 )
+from unirender_evaluation.results.data import Results
+from unirender_evaluation.results.file import read_results
 from unirender_evaluation.results.verdict import claims_table
 from unirender_evaluation.suites.suite import Suite, load_suite
 

@@ -15,9 +15,9 @@ from unirender.errors import UnirenderError
 from unirender_evaluation.claims import MASKED
 from unirender_evaluation.comparisons import Selection, values_of
 from unirender_evaluation.metrics import METRICS, SCALES, Metric, Variant, metric_key
+from unirender_evaluation.pages.findings import NOT_RUN, Question, interval_text, label_of, markdown_table
 from unirender_evaluation.records import Record
 from unirender_evaluation.results.data import Results
-from unirender_evaluation.results.findings import NOT_RUN, Question, interval_text, label_of, markdown_table
 from unirender_evaluation.statistics import FEWEST, Estimate, mean_estimate, student_half_width
 from unirender_evaluation.tables.formats import MISSING, estimate_text
 

@@ -13,13 +13,13 @@ from unirender.errors import UnirenderError
 from unirender.shipped import checkpoint_folder, checkpoint_sha256
 from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.metrics import DEFAULT_VARIANT
+from unirender_evaluation.pages import readme
 from unirender_evaluation.records import MethodInfo, Record, RunInfo, append_record, write_records, write_run
-from unirender_evaluation.results import readme
 from unirender_evaluation.table_list import ALL_TABLES
 from unirender_evaluation.tables.build import build_tables
 from unirender_evaluation.task import LIGHT
 
-STORED = Path(__file__).resolve().parents[2] / "evaluation" / "results"
+STORED = Path(__file__).resolve().parents[3] / "evaluation" / "results"
 SLOT = "<!-- {0}:begin -->\nwhat was here\n<!-- {0}:end -->\n"
 README = "# title\n\n" + "\n".join(map(SLOT.format, ("standing", "results", "checkpoint"))) + "\nend\n"
 
@@ -211,12 +211,12 @@ def test_the_projects_tables_and_readme_are_those_of_its_stored_values(suite: st
     where = ["--readme", str(target)] if suite == readme.README_SUITE else []
     options = ["--stored", str(tmp_path), *(["--of", checkpoint] if checkpoint else where)]
     subprocess.run(
-        [sys.executable, "-m", "unirender_evaluation.results.readme", str(STORED / suite), *options], check=True
+        [sys.executable, "-m", "unirender_evaluation.pages.readme", str(STORED / suite), *options], check=True
     )
     folders = STORED / suite, tmp_path / suite
     committed, made = ({path.name: path.read_text() for path in folder.glob("*.md")} for folder in folders)
     again = (
-        "make them again: python -m unirender_evaluation.results.readme evaluation/results/SUITE --stored "
+        "make them again: python -m unirender_evaluation.pages.readme evaluation/results/SUITE --stored "
         "evaluation/results (standard: --readme README.md; SUITE-CHECKPOINT: --of CHECKPOINT)"
     )
     assert committed == made, again

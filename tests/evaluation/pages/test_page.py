@@ -8,10 +8,10 @@ from doc_blocks import DOCS, blocks
 from small_results import small_results
 
 from unirender.errors import UnirenderError
-from unirender_evaluation.results import page as page_module
-from unirender_evaluation.results.findings import Question
-from unirender_evaluation.results.page import Page
-from unirender_evaluation.results.questions import BY_TARGET, SECTIONS, VIEWS, Section
+from unirender_evaluation.pages import page as page_module
+from unirender_evaluation.pages.findings import Question
+from unirender_evaluation.pages.page import Page
+from unirender_evaluation.pages.questions import BY_TARGET, SECTIONS, VIEWS, Section
 from unirender_evaluation.suites.suite import load_suite
 
 CELL, TAGS = "{code-cell} python", ":tags: [remove-input]\n"

@@ -7,9 +7,7 @@ from small_results import METHODS, RUN, small_records, small_results
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import metric_key
-from unirender_evaluation.records import Record
-from unirender_evaluation.results.data import Results, definitions
-from unirender_evaluation.results.findings import (
+from unirender_evaluation.pages.findings import (
     NOT_RUN,
     Question,
     against_trivial,
@@ -20,6 +18,8 @@ from unirender_evaluation.results.findings import (
     sure_of,
     together,
 )
+from unirender_evaluation.records import Record
+from unirender_evaluation.results.data import Results, definitions
 from unirender_evaluation.tables.published import published_tables
 
 

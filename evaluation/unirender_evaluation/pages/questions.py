@@ -23,7 +23,7 @@ from unirender_evaluation.claims import (
 )
 from unirender_evaluation.light_balls import GLOSSY_BALL, MATTE_BALL
 from unirender_evaluation.metrics import METRICS, Scale
-from unirender_evaluation.results.findings import Question
+from unirender_evaluation.pages.findings import Question
 from unirender_evaluation.task import LIGHT
 
 STANDARD, BY_TARGET, BOTH_SIZES = VIEWS = ("standard", "by target", "both sizes")

@@ -9,10 +9,10 @@ from small_results import RUN, small_results
 
 from unirender.errors import UnirenderError
 from unirender_evaluation.metrics import SCALES, Variant, metric_key
+from unirender_evaluation.pages.findings import NOT_RUN, Question
+from unirender_evaluation.pages.groups import by_kind, by_material, by_object, by_scale, contrast, material_of
 from unirender_evaluation.records import Record
 from unirender_evaluation.results.data import Results, definitions
-from unirender_evaluation.results.findings import NOT_RUN, Question
-from unirender_evaluation.results.groups import by_kind, by_material, by_object, by_scale, contrast, material_of
 
 ALBEDO = ("albedo", "psnr")
 

@@ -1,4 +1,4 @@
-"""How often 95 % intervals hold the truth: `python -m unirender_evaluation.results.coverage [SUITE [RESULTS]]`.
+"""How often 95 % intervals hold the truth: `python -m unirender_evaluation.pages.coverage [SUITE [RESULTS]]`.
 
 Draws paired differences of two rows on the objects and lights that a suite has, where objects, lights and pictures
 differ by known amounts, and counts how often each interval (`statistics`) holds their mean. A second table takes what
@@ -17,9 +17,9 @@ from jaxtyping import Float, Int
 
 from unirender_evaluation.claims import run_claims
 from unirender_evaluation.comparisons import Selection, values_of
+from unirender_evaluation.pages.findings import markdown_table
 from unirender_evaluation.results.data import Results
 from unirender_evaluation.results.file import read_results
-from unirender_evaluation.results.findings import markdown_table
 from unirender_evaluation.statistics import (
     CONFIDENCE,
     FEWEST_LIGHTS,

@@ -1,6 +1,6 @@
 """Copies the tables of a benchmark run into the README and into the documentation, so that no number is typed.
 
-    python -m unirender_evaluation.results.readme RUN [--readme README.md] [--stored FOLDER] [--of CHECKPOINT]
+    python -m unirender_evaluation.pages.readme RUN [--readme README.md] [--stored FOLDER] [--of CHECKPOINT]
 
 `RUN` is the folder that `unirender bench run` wrote, or its results file. The README shows results of `standard` alone,
 between comments made for them: where our model stands (`STANDING`), and rows and columns of the paper's tables and of
@@ -29,11 +29,11 @@ from unirender.system.whole_files import replace_file
 from unirender_evaluation.claims import OPTIMISED
 from unirender_evaluation.light_balls import MATTE_BALL
 from unirender_evaluation.metrics import DEFAULT_VARIANT, PUBLISHED_VARIANT, Variant
+from unirender_evaluation.pages.findings import Question, against_trivial
 from unirender_evaluation.records import Record
 from unirender_evaluation.results.commands import asked_specs
 from unirender_evaluation.results.data import NAME, PACKED, Results
 from unirender_evaluation.results.file import read_results, write_results
-from unirender_evaluation.results.findings import Question, against_trivial
 from unirender_evaluation.results.lights import lights_of
 from unirender_evaluation.subsets import STANDARD
 from unirender_evaluation.table_list import ALL_TABLES
@@ -252,7 +252,7 @@ def store(folder: Path, results: Results, tables: Sequence[Table]) -> None:
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; 0, or 1 with one line on standard error."""
     parser = argparse.ArgumentParser(
-        prog="python -m unirender_evaluation.results.readme", description="Copies result tables into the README."
+        prog="python -m unirender_evaluation.pages.readme", description="Copies result tables into the README."
     )
     parser.add_argument("run", type=Path, help="folder that `unirender bench run --out` wrote, or its results file")
     parser.add_argument(
