@@ -43,7 +43,13 @@ def read_input(
     import numpy as np
 
     from unirender.color import srgb_decode
-    from unirender.picture_files.mask_rim import MIXED, mixture_explains, without_background
+    from unirender.picture_files.mask_rim import (
+        BACKGROUND,
+        MIXED,
+        mixture_explains,
+        outline_is_background,
+        without_background,
+    )
     from unirender.pictures import OPAQUE, header_pixels, read_mask_file, read_picture
 
     pixels = header_pixels(path)
@@ -61,6 +67,11 @@ def read_input(
             remarks["rim"] = (
                 "the picture's background is mixed into the rim of the mask: the colours next to it, further inside, "
                 "are taken there"
+            )
+        elif opaque and outline_is_background(picture.image_srgb, coverage) > BACKGROUND:
+            remarks["outline"] = (
+                "the outline of the mask shows the background, which goes into roughness and albedo: the mask is too "
+                "large, shrink it by a pixel or more"
             )
         picture = dataclasses.replace(picture, mask=coverage)
         if coverage.min() >= OPAQUE:
