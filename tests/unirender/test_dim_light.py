@@ -65,8 +65,8 @@ def test_what_the_network_cuts_off_at_white_is_in_the_closed_form() -> None:
     np.testing.assert_allclose(image[0, :, 0], [0.3, 0.04, 0.25], rtol=1e-6)
 
 
-def test_dim_renders_are_nearer_to_the_truth_than_the_closed_form() -> None:
-    """Of the network's own rendering of such light none of these is."""
+def test_dim_renders_are_as_near_to_the_truth_as_the_closed_form() -> None:
+    """To half a decibel; what the network renders of such light as it is lies some 7 dB below."""
     pipeline = UniRenderPipeline.from_pretrained("tiny")
     pipeline.set_progress_bar_config(disable=True)
     suite, dim = load_suite("tiny"), 1 / 64
