@@ -615,6 +615,30 @@ def test_a_light_that_is_taken_as_a_photograph_is_told(tmp_path: Path, caplog: p
 
 
 @pytest.mark.parametrize(
+    ("size", "said"), [((64, 43), ""), ((64, 64), "only the middle 50% of its height"), ((48, 64), "the middle 38%")]
+)
+def test_a_photograph_that_does_not_fit_the_sphere_is_told(
+    size: tuple[int, int], said: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    Image.new("RGB", size, (200, 180, 160)).save(tmp_path / "light.jpg")
+    load_light(tmp_path / "light.jpg", photograph=True)
+    assert said in caplog.text
+    assert len(caplog.messages) == bool(said)
+
+
+@pytest.mark.parametrize(("covered", "told"), [(64, False), (63, False), (40, True)])
+def test_a_light_that_is_an_object_cut_out_is_told(
+    covered: int, told: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rgba = np.full((32, 64, 4), 180, np.uint8)
+    rgba[..., 3] = 255 * (np.arange(64) < covered)
+    Image.fromarray(rgba).save(tmp_path / "albedo.png")
+    load_light(tmp_path / "albedo.png", photograph=True)
+    assert ("38% of it is transparent, as around an object that is cut out" in caplog.text) == told
+    assert len(caplog.messages) == told
+
+
+@pytest.mark.parametrize(
     "error",
     [
         MemoryError(),

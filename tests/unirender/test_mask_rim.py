@@ -10,7 +10,13 @@ from tiny_models import make_pipeline
 
 from unirender.color import image_srgb, srgb_decode
 from unirender.command_line.input_picture import read_input
-from unirender.picture_files.mask_rim import MIXED, mixture_explains, without_background
+from unirender.picture_files.mask_rim import (
+    BACKGROUND,
+    MIXED,
+    mixture_explains,
+    outline_is_background,
+    without_background,
+)
 
 SIDE = 48
 
@@ -75,6 +81,42 @@ def test_a_soft_matte_stays_as_it_is() -> None:
     cleaned = without_background(picture, mask)
     np.testing.assert_array_equal(cleaned[:, 10:], picture[:, 10:])
     np.testing.assert_array_equal(cleaned[:, 9], picture[:, 7])
+
+
+def hard(radius: float) -> Float[np.ndarray, "h w 1"]:
+    """All 0 or 1."""
+    rows, columns = np.mgrid[:SIDE, :SIDE] + 0.5 - SIDE / 2
+    return (np.hypot(rows, columns) < radius)[..., None].astype(np.float32)
+
+
+@pytest.mark.parametrize("linear", [False, True])
+@pytest.mark.parametrize("background", [0.0, 0.75, 1.0])
+def test_a_mask_that_is_too_large_is_told_from_one_that_fits(background: float, linear: bool) -> None:
+    picture = over(background, linear)  # of a disc of radius 15.8
+    for larger in (17.0, 18.0):
+        assert outline_is_background(picture, hard(larger)) > BACKGROUND
+    for fits in (disc(), hard(15.8), hard(15.0), hard(14.0)):
+        assert outline_is_background(picture, fits) < BACKGROUND - 0.2
+
+
+def test_nothing_is_told_of_an_outline_where_object_and_background_are_alike_or_out_of_the_frame() -> None:
+    assert outline_is_background(np.full((SIDE, SIDE, 3), 0.5, np.float32), hard(17.0)) == 0
+    assert outline_is_background(over(1.0, False), np.ones((SIDE, SIDE, 1), np.float32)) == 0
+    assert outline_is_background(over(1.0, False), hard(2.0)) == 0
+
+
+def test_a_command_says_that_the_mask_is_too_large(tmp_path: Path) -> None:
+    rgb = (255 * over(0.9, False) + 0.5).astype(np.uint8)
+    Image.fromarray(rgb).save(tmp_path / "a.png")
+    alpha = (255 * hard(17.0) + 0.5).astype(np.uint8)
+    Image.fromarray(np.concatenate([rgb, alpha], axis=-1)).save(tmp_path / "rgba.png")
+    for name, radius in {"large": 17.0, "fits": 15.8}.items():
+        Image.fromarray((255 * hard(radius)[..., 0]).astype(np.uint8)).save(tmp_path / f"{name}.png")
+    _, remarks = read_input(tmp_path / "a.png", tmp_path / "large.png")
+    assert remarks.keys() == {"outline"}
+    assert remarks["outline"].startswith("the outline of the mask shows the background")
+    assert not read_input(tmp_path / "a.png", tmp_path / "fits.png")[1]
+    assert not read_input(tmp_path / "rgba.png", tmp_path / "large.png")[1]  # whose colours are straight
 
 
 def test_a_command_takes_the_background_out_of_the_rim_and_says_so(tmp_path: Path) -> None:

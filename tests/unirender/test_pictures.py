@@ -13,7 +13,7 @@ from icc_profiles import SRGB_D50, matrix_profile
 from PIL import ExifTags, Image, ImageCms
 from sixteen_bit_files import write_png16, write_small_grey_png, write_tiff16
 
-from unirender.color import srgb_encode
+from unirender.color import srgb_decode, srgb_encode
 from unirender.command_line.commands import Decompose, Relight, Render
 from unirender.command_line.input_picture import BYTES_A_PIXEL, BYTES_OF_NONE, RENDERED_BYTES_A_PIXEL, read_input
 from unirender.command_line.options import DecompositionOptions, InputOptions, OutputOptions
@@ -376,6 +376,16 @@ def test_lost_highlights_and_an_underexposed_object_are_told(tmp_path: Path) -> 
         remarks = read_input(tmp_path / "a.png", None)[1]
         assert remarks.keys() == told.keys()
         assert all(remarks[kind].startswith(text) for kind, text in told.items())
+
+
+@pytest.mark.parametrize("stops", [3, 6])
+def test_by_how_much_an_underexposed_picture_is_to_be_brightened_is_told(stops: int, tmp_path: Path) -> None:
+    """Of a picture that reaches 0.8 of white at the exposures that were taught."""
+    radiance = srgb_decode(np.linspace(0.2, 0.81, 400, dtype=np.float32).reshape(20, 20, 1).repeat(3, axis=-1))
+    write_exr(tmp_path / "a.exr", image_channels(radiance / 2**stops))
+    assert read_input(tmp_path / "a.exr", None)[1]["dark"].endswith(
+        f"brighten the picture first, by some {stops} stops"
+    )
 
 
 def test_what_is_no_number_is_refused_with_its_place(tmp_path: Path) -> None:

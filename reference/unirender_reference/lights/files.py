@@ -20,10 +20,18 @@ from unirender.picture_files import display_files
 from unirender.pictures import check_finite, negative_share
 from unirender.system.machine import memory_excess
 from unirender_reference.lights.light import SHAPE, Light, area_resampled, mean_luminance
-from unirender_reference.lights.photograph import PHOTOGRAPH_SHAPE, RULE, expand_range, photograph_environment
+from unirender_reference.lights.photograph import (
+    PHOTOGRAPH_SHAPE,
+    RULE,
+    expand_range,
+    photograph_environment,
+    shown_rows,
+)
 from unirender_reference.lights.radiance import header_texels, read_radiance
 
 BYTES_A_TEXEL, BYTES_OF_NONE = 50, 5e8  # of memory: what it takes to read a map and bring it to the contract's grid
+MUCH_CLEAR = 0.05  # transparent share of a photograph from which a notice is due
+MOST_ROWS = 0.6  # share of its height that is taken, likewise: of 3 : 2 it is 0.75, of a square 0.5
 HDR_SUFFIXES = {".hdr", ".rgbe", ".pic", ".exr", ".pfm"}
 
 _log = logging.getLogger("unirender.lights")
@@ -78,6 +86,8 @@ def load_light(
             "HDR, EXR or PFM file (in Python also any other, with photograph=False)",
             path,
         )
+    if as_photograph and (seen := shown_rows(*pixels.shape[:2])) < MOST_ROWS:
+        _log.warning("light %s: only the middle %.0f%% of its height is taken, as more does not fit", path, 100 * seen)
     if as_photograph:
         rule, environment = RULE, photograph_environment(pixels, shape or PHOTOGRAPH_SHAPE)
     else:
@@ -112,7 +122,15 @@ def _lat_long(
 
 def _read_ldr(path: Path) -> Float[np.ndarray, "h w 3"]:
     """Display values of a picture, upright; an alpha channel is dropped."""
-    return np.ascontiguousarray(display_files.srgb_values(path, f"light {path}")[..., :3])
+    values = display_files.srgb_values(path, f"light {path}")
+    if values.shape[-1] == 4 and (clear := 1 - float(values[..., 3].mean())) > MUCH_CLEAR:
+        _log.warning(
+            "light %s: %.0f%% of it is transparent, as around an object that is cut out, and taken as light, too: "
+            "expected a picture of the surroundings",
+            path,
+            100 * clear,
+        )
+    return np.ascontiguousarray(values[..., :3])
 
 
 def _check_memory(path: Path, hdr: bool) -> None:

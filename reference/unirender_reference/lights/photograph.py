@@ -28,6 +28,11 @@ def expand_range(linear: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3
     return (linear * (1 + (PEAK - 1) * t * t)).astype(np.float32)
 
 
+def shown_rows(height: int, width: int) -> float:
+    """The share of a photograph's rows that the window holds: equal angles per pixel both ways."""
+    return min(1.0, width * WINDOW_DEG / 90 / height)
+
+
 def photograph_environment(pixels: Float[np.ndarray, "h w 3"], shape: tuple[int, int]) -> Float[np.ndarray, "h2 w2 3"]:
     """Step 2 of the photograph rule: a linear picture on the sphere."""
     rows, half = 2 * shape[0], shape[1]  # drawn at twice the size, then averaged on to the grid

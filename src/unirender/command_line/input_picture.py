@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from unirender.pictures import Picture
 
 DARK = 0.35  # display value that an object reaches at the exposures of the training data, unless it is dark itself
+USUAL = 0.8  # that most reach there
 FULL_COVERAGE = 0.95  # that a mask reaches on an object
 FEW_PIXELS = 16  # that an object covers: of fewer a notice is due
 MANY_CLIPPED = 0.05  # share of clipped pixels from which a notice is due
@@ -41,7 +42,14 @@ def read_input(
     """
     import numpy as np
 
-    from unirender.picture_files.mask_rim import MIXED, mixture_explains, without_background
+    from unirender.color import srgb_decode
+    from unirender.picture_files.mask_rim import (
+        BACKGROUND,
+        MIXED,
+        mixture_explains,
+        outline_is_background,
+        without_background,
+    )
     from unirender.pictures import OPAQUE, header_pixels, read_mask_file, read_picture
 
     pixels = header_pixels(path)
@@ -59,6 +67,11 @@ def read_input(
             remarks["rim"] = (
                 "the picture's background is mixed into the rim of the mask: the colours next to it, further inside, "
                 "are taken there"
+            )
+        elif opaque and outline_is_background(picture.image_srgb, coverage) > BACKGROUND:
+            remarks["outline"] = (
+                "the outline of the mask shows the background, which goes into roughness and albedo: the mask is too "
+                "large, shrink it by a pixel or more"
             )
         picture = dataclasses.replace(picture, mask=coverage)
         if coverage.min() >= OPAQUE:
@@ -79,9 +92,11 @@ def read_input(
     if (most := picture.mask.max()) < FULL_COVERAGE:
         remarks["coverage"] = f"the mask is at most {most:.2f}, as of something transparent: expected 1 on the object"
     if (bright := float(np.percentile(picture.image_srgb[covered].max(axis=-1), 99))) < DARK:
+        usual, reached = srgb_decode(np.array([USUAL, max(bright, 1 / 255)], np.float32))
         remarks["dark"] = (
             f"the object is dark, 99% of it below {bright:.2f} of display white: the network was taught exposures at "
-            "which white is bright, and a darker one goes into the albedo"
+            "which white is bright, and a darker one goes into the albedo; unless the object itself is dark, brighten "
+            f"the picture first, by some {np.log2(usual / reached):.0f} stops"
         )
     if picture.negative:
         remarks["negative"] = f"{100 * picture.negative:.1g}% of the picture's radiance is negative and was set to 0"

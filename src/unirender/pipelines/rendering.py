@@ -10,7 +10,8 @@ from unirender.blocks import by_rows
 from unirender.color import image_srgb as encode_srgb
 from unirender.color import srgb_decode
 from unirender.intrinsics import Intrinsics
-from unirender.models.priors import PRIORS
+from unirender.models.priors import PRIORS, Prior
+from unirender.pipelines.dim_light import brightened, darkened
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.masked_maps import divide
 from unirender.pipelines.network import Network, Overflow
@@ -46,14 +47,19 @@ def render_any_size(
             surfaces cast, and what they reflect.
     """
     without_shadows = [told_derived(to_derive(scene), shadows).union(derived) for scene in scenes]
-    ready = deque(ready_to_render(scene, shadows) for scene in scenes)
+    ready = deque(brightened(ready_to_render(scene, shadows)) for scene in scenes)
     del scenes
-    entered = [enter(network, scene) for scene in ready]
+    entered = [enter(network, scene) for scene, _ in ready]
     for _, small in entered:
         watch(network.overflow(small))
     rendered = network.images([small for _, small in entered], how, without_shadows)
     for (frame, small), image in zip(entered, rendered, strict=True):
-        yield _leave(network, ready.popleft(), frame, small, image)
+        scene, gain = ready.popleft()
+        left = _leave(network, scene, frame, small, image)
+        if gain != 1:
+            closed_form = _prior(network).image(scene) if _has_closed_form(scene) else None
+            left = darkened(left, closed_form, scene.require("mask")["mask"], gain)
+        yield left
 
 
 def _leave(
@@ -64,13 +70,21 @@ def _leave(
     if frame.identity:
         return rendered * (mask > 0)
     inside = small.require("mask")["mask"]
-    if not {"albedo", "specular", "diffuse"} <= set(intrinsics.present):
+    if not _has_closed_form(intrinsics):
         return np.clip(frame.leave_map(divide(rendered, inside), mask), 0, 1) * mask
     # The detail of a larger picture is in its closed form; the model adds what it lacks, in display values.
-    closed_form = network.conditioning.physics_prior or PRIORS["split_sum"]
+    closed_form = _prior(network)
     pictures = {"rendered": divide(rendered, inside), "closed form": divide(closed_form.image(small), inside)}
     radiance, small_image = frame.leave_maps(pictures, mask).values()
     return by_rows(_with_change, closed_form.image(intrinsics), mask, small_image, radiance)
+
+
+def _prior(network: Network) -> Prior:
+    return network.conditioning.physics_prior or PRIORS["split_sum"]
+
+
+def _has_closed_form(intrinsics: Intrinsics) -> bool:
+    return {"albedo", "specular", "diffuse"} <= set(intrinsics.present)
 
 
 def _with_change(

@@ -32,6 +32,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.picture_files.mask_rim import MIXED, mixture_explains
 from unirender.pipelines.carried_light import with_carried_light
 from unirender.pipelines.decomposing import View, decompose_views
+from unirender.pipelines.dim_light import brightened
 from unirender.pipelines.dual_stream_pipeline import DualStreamPipeline
 from unirender.pipelines.editing import anchor, check_exposure, specular_for_roughness, too_coarse, under_light
 from unirender.pipelines.framing import thumbnail
@@ -236,11 +237,11 @@ class UniRenderPipeline(DualStreamPipeline):
 
         Args:
             intrinsics: normal, roughness and metallic are needed; albedo, specular, diffuse and environment may be
-                missing. Light is expected as bright as in the training data (white near display white): the error of
-                the network does not shrink with it, so scale a dim light up, and the picture down. A missing mask is
-                where the normal is not 0 (the whole frame where it is 0 nowhere); missing s and d are derived from the
-                environment where it is given. Those that are there count, whatever it is: under another light
-                `intrinsics.replace(environment=light, specular=None, diffuse=None)` is rendered.
+                missing. A missing mask is where the normal is not 0 (the whole frame where it is 0 nowhere); missing s
+                and d are derived from the environment where it is given. Those that are there count, whatever it is:
+                under another light `intrinsics.replace(environment=light, specular=None, diffuse=None)` is rendered.
+                Light far dimmer than in the training data is rendered brighter, and the picture made dark again
+                (`unirender.pipelines.dim_light`).
             mode: as for `decompose`, like the other settings.
             num_inference_steps: of `sample`.
             num_samples: of `sample`.
@@ -287,7 +288,8 @@ class UniRenderPipeline(DualStreamPipeline):
         """
         check_rendered(intrinsics, ())
         network = self._network()
-        return network.overflow(enter(network, ready_to_render(intrinsics))[1])
+        maps, _ = brightened(ready_to_render(intrinsics))
+        return network.overflow(enter(network, maps)[1])
 
     def edit(
         self,
