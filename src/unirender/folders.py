@@ -254,7 +254,7 @@ def figures_of(folder: Path, meta: Mapping[str, Any]) -> dict[str, Any] | None:
     """
     try:
         stored = json.loads((folder / META_FILE).read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     if not isinstance(stored, dict):
         return None

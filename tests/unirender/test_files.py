@@ -409,7 +409,9 @@ def test_an_environment_from_elsewhere_is_not_taken_for_one_of_ours(tmp_path: Pa
         read_result(tmp_path)
 
 
-@pytest.mark.parametrize("text", ["[]", "3", "null"])
+@pytest.mark.parametrize(
+    "text", ["[]", "3", "null", "[" * 100_000, f'{{"fov_deg": {10**400}}}', '{"fov_deg": 36, "principal": 1}']
+)
 def test_a_meta_file_that_is_no_account_is_refused(text: str, tmp_path: Path) -> None:
     mask = np.ones((8, 8, 1), dtype=np.float32)
     write_result(tmp_path, Intrinsics(mask=mask, roughness=mask, camera=Camera()), {})
