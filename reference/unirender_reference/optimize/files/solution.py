@@ -41,5 +41,5 @@ def read_solution_file(path: Path) -> Solution | MeshObject:
         environment = arrays.pop(_ENVIRONMENT, None)
         obj = MeshObject(**text, **arrays)
     except Exception as error:  # NumPy raises half a dozen kinds for a damaged file
-        raise UnirenderError(f"{path}: no readable state ({error}); delete the folder to begin anew") from error
+        raise UnirenderError(f"{path}: no readable state ({error!s:.200}); delete the folder to begin anew") from error
     return obj if environment is None else Solution(obj, environment)

@@ -79,7 +79,7 @@ class RefineState:
                 arrays = {name: file[name] for name in file.files}
         except Exception as error:  # NumPy raises half a dozen kinds for a damaged file
             raise UnirenderError(
-                f"{path}: no readable state of a refinement ({error}); delete it to begin anew"
+                f"{path}: no readable state of a refinement ({error!s:.200}); delete it to begin anew"
             ) from error
         found, expected = ({name: array.shape for name, array in own.items()} for own in (arrays, state._arrays()))
         for name in sorted({*found, *expected}):
