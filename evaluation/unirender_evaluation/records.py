@@ -224,9 +224,11 @@ def read_run(path: Path) -> RunInfo:
 
 def run_from_plain(data: dict[str, Any]) -> RunInfo:
     """A `RunInfo` from the JSON object that `write_run` writes; raises UnirenderError on unknown or missing fields."""
-    methods = tuple(_build(MethodInfo, item) for item in data.get("methods", ()))
-    tuples = {name: tuple(data.get(name, ())) for name in ("lpips", "seeds")}
-    return _build(RunInfo, data | tuples | {"methods": methods})
+    lists = {name: data.get(name, []) for name in ("methods", "lpips", "seeds")}
+    if wrong := [name for name, value in lists.items() if not isinstance(value, list)]:
+        raise UnirenderError(f"run field {wrong[0]!r}: got {lists[wrong[0]]!r:.60}, expected a list")
+    methods = tuple(_build(MethodInfo, item) for item in lists["methods"])
+    return _build(RunInfo, data | {name: tuple(value) for name, value in lists.items()} | {"methods": methods})
 
 
 def _build(cls: type[T], data: Any) -> T:
@@ -234,7 +236,9 @@ def _build(cls: type[T], data: Any) -> T:
         raise UnirenderError(f"expected a JSON object for {cls.__name__}, got {type(data).__name__}")
     try:
         return cls(**data)
-    except TypeError as error:
+    except UnirenderError:
+        raise
+    except (TypeError, ValueError) as error:
         raise UnirenderError(f"{cls.__name__}: {error}".replace("__init__() ", "")) from error
 
 

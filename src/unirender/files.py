@@ -229,5 +229,5 @@ def _camera_of_meta(path: Path) -> Camera | None:
             return None
         x, y = meta.get("principal", Camera().principal)
         return Camera(fov_deg=float(meta["fov_deg"]), principal=(float(x), float(y)))
-    except (ValueError, TypeError, AttributeError) as error:
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:  # no JSON, or numbers that are none
         raise UnirenderError(f"{path}: not readable ({error}); delete it to use the camera of the EXR file") from error

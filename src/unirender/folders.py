@@ -158,6 +158,10 @@ def decompose_folder(
         for (path, _, meta), result in zip(batch, results, strict=True):
             try:
                 again = overwrite or path in damaged
+                if not again and (figures := figures_of(output / path.name, meta)) is not None:
+                    done.figures[path.name] = figures  # of another process, which was faster
+                    done.kept += 1
+                    continue
                 with new_folder(output / path.name, overwrite=again, tidy=False) as folder:
                     written = write_decomposition(folder, result, meta)
             except UnirenderError as error:
@@ -254,7 +258,7 @@ def figures_of(folder: Path, meta: Mapping[str, Any]) -> dict[str, Any] | None:
     """
     try:
         stored = json.loads((folder / META_FILE).read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
     if not isinstance(stored, dict):
         return None

@@ -1,6 +1,7 @@
 """The result schema: round trips, and every refusal."""
 
 import csv
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,23 @@ def test_another_schema_and_a_missing_file_are_refused(tmp_path: Path) -> None:
     write_run(path, run())
     path.write_text(path.read_text().replace('"schema": 1', '"schema": 0'))
     with pytest.raises(UnirenderError, match="got schema 0, expected 1"):
+        read_run(path)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "match"),
+    [
+        ("methods", 3, "run field 'methods': got 3, expected a list"),
+        ("lpips", 0.5, "run field 'lpips': got 0.5, expected a list"),
+        ("methods", [{"key": "a", "label": "A", "kind": "ours", "config": "x"}], "^MethodInfo: "),
+        ("methods", ["x"], "expected a JSON object for MethodInfo, got str"),
+    ],
+)
+def test_a_run_with_fields_of_another_kind_is_refused(field: str, value: object, match: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.json"
+    write_run(path, run())
+    path.write_text(json.dumps(json.loads(path.read_text()) | {field: value}))
+    with pytest.raises(UnirenderError, match=match):
         read_run(path)
 
 

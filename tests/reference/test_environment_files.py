@@ -112,6 +112,31 @@ def test_runs_of_old_radiance_files_are_named(tmp_path: Path) -> None:
     assert np.allclose(load_light(tmp_path / "flat.hdr", normalise=False).environment, 1, atol=0.01)
 
 
+def coded_rows(rows: int) -> bytes:
+    """A Radiance file of 8 columns: its header, and rows that each have four runs."""
+    return b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y %d +X 8\n" % rows + rows * (b"\2\2\0\x08" + 4 * b"\x88\x80")
+
+
+def test_a_damaged_row_of_a_radiance_file_is_told(tmp_path: Path) -> None:
+    """Where a row begins elsewhere than the one above ends, Mitsuba writes beyond its picture and the process dies."""
+    path, whole = tmp_path / "a.hdr", coded_rows(4)
+    path.write_bytes(whole)
+    assert load_light(path, normalise=False).environment.shape == (64, 128, 3)
+    for damaged in (whole[:-12] + b"\0" + whole[-11:], whole[:-13] + whole[-12:], whole[:-12] + b"\0" + whole[-12:]):
+        path.write_bytes(damaged)
+        with pytest.raises(UnirenderError, match=r"a\.hdr: row 4 of 4 does not begin where .*; copy it again"):
+            load_light(path)
+
+
+def test_a_radiance_file_without_a_size_is_told(tmp_path: Path) -> None:
+    (tmp_path / "a.hdr").write_bytes(coded_rows(4).replace(b"-Y 4", b"-Y x"))
+    with pytest.raises(UnirenderError, match=r"its header has no size, expected '-Y height \+X width'"):
+        load_light(tmp_path / "a.hdr")
+    (tmp_path / "a.pfm").write_bytes(b"PF\nx 4\n-1.0\n" + bytes(100))
+    with pytest.raises(UnirenderError, match="not a readable HDR map"):
+        load_light(tmp_path / "a.pfm")
+
+
 RGBE, PFM = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8192 +X 16384\n", b"PF\n16384 8192\n-1.0\n"
 
 

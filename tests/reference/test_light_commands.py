@@ -1,6 +1,7 @@
 """`unirender lights`: what it prints and writes."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +89,13 @@ def test_a_failed_export_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(UnirenderError, match="two lights have this name"):
         Lights(pool=tmp_path / "pool", export=tmp_path / "out").run()
     assert [path.name for path in tmp_path.iterdir()] == ["pool"]
+
+
+def test_what_a_killed_export_left_goes_after_a_day(tmp_path: Path) -> None:
+    (tmp_path / ".lights.0123456789ab").mkdir()
+    os.utime(tmp_path / ".lights.0123456789ab", (0, 0))
+    Lights(split="test", draw=(3, 5), export=tmp_path / "lights").run()
+    assert [path.name for path in tmp_path.iterdir()] == ["lights"]
 
 
 def test_a_folder_is_listed_with_reasons_and_what_looks_alike(

@@ -380,6 +380,23 @@ def test_unusable_folders_are_refused(folder: Path, tmp_path: Path) -> None:
         GroupDataset(altered)
 
 
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("[" * 100_000, "not a readable manifest"),
+        ('{"shards": ["x"]}', "not a readable manifest"),
+        (f'{{"shards": [{{"name": "a", "sha256": "b", "bytes": {"9" * 5000}}}]}}', "not a readable manifest"),
+        ('{"shards": [{"name": 5, "sha256": "b"}]}', "shards 5 of the manifest are missing"),
+    ],
+)
+def test_a_manifest_of_another_kind_is_refused(text: str, match: str, tmp_path: Path) -> None:
+    folder = write_dataset(tmp_path / "data", size=16)
+    (folder / "manifest.json").write_text(text)
+    with pytest.raises(UnirenderError, match=match):
+        GroupDataset(folder)
+    assert split_of(folder) is None
+
+
 def test_a_shard_of_another_size_is_noticed_although_it_was_packed(tmp_path: Path) -> None:
     folder = write_dataset(tmp_path / "data", size=16)
     manifest = folder / "manifest.json"

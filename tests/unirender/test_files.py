@@ -1,5 +1,6 @@
 """Result folders: what is written reads back, and what goes wrong leaves nothing behind."""
 
+import contextlib
 import errno
 import json
 import os
@@ -154,6 +155,35 @@ def test_what_a_kill_left_half_made_goes_after_a_day(tmp_path: Path) -> None:
     with new_folder(tmp_path / "a"):
         pass
     assert {path.name for path in tmp_path.iterdir()} == {"a", ".a.fedcba987654", ".b.0123456789ab", ".a.old.x1"}
+
+
+def test_what_a_kill_left_of_a_replaced_result_goes_after_a_day(tmp_path: Path) -> None:
+    """Only where there is another now: else it may be all that is left."""
+    replaced = tmp_path / ".a.old.ab_12xyz"
+    for there in (False, True):
+        (replaced / "old").mkdir(parents=True, exist_ok=True)
+        os.utime(replaced, (0, 0))
+        with new_folder(tmp_path / "a", overwrite=True) as folder:
+            (folder / "meta.json").touch()
+        assert replaced.exists() != there
+
+
+def test_a_signal_while_the_old_result_goes_leaves_nothing_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = shutil.rmtree
+
+    def interrupted(path: Path, ignore_errors: bool = False) -> None:
+        if not ignore_errors:
+            raise KeyboardInterrupt
+        whole(path, ignore_errors=True)
+
+    for text in ("old", "new"):
+        with contextlib.suppress(KeyboardInterrupt), new_folder(tmp_path / "a", overwrite=True) as folder:
+            (folder / "meta.json").write_text(text)
+            monkeypatch.setattr(shutil, "rmtree", interrupted)
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+    assert (tmp_path / "a" / "meta.json").read_text() == "new"
 
 
 def test_a_folder_that_may_not_be_listed_is_written_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -409,7 +439,9 @@ def test_an_environment_from_elsewhere_is_not_taken_for_one_of_ours(tmp_path: Pa
         read_result(tmp_path)
 
 
-@pytest.mark.parametrize("text", ["[]", "3", "null"])
+@pytest.mark.parametrize(
+    "text", ["[]", "3", "null", "[" * 100_000, f'{{"fov_deg": {10**400}}}', '{"fov_deg": 36, "principal": 1}']
+)
 def test_a_meta_file_that_is_no_account_is_refused(text: str, tmp_path: Path) -> None:
     mask = np.ones((8, 8, 1), dtype=np.float32)
     write_result(tmp_path, Intrinsics(mask=mask, roughness=mask, camera=Camera()), {})

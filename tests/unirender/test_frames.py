@@ -139,6 +139,18 @@ def test_what_is_done_is_kept_and_what_differs_is_no_silent_reuse(tmp_path: Path
     assert figures_of(tmp_path / "out" / "a.png", SETTINGS) is None
 
 
+def test_two_runs_at_once_keep_what_the_other_has_done(tmp_path: Path) -> None:
+    """The second finishes while the first looks at its pictures."""
+    pictures, out = [save(tmp_path / f"{name}.png") for name in "ab"], tmp_path / "out"
+
+    def slowly(batch: list[Picture]) -> list[Decomposition]:
+        assert run(pictures, out).kept == 0
+        return decompose(batch)
+
+    first = run(pictures, out, decompose=slowly)
+    assert (first.kept, sorted(first.figures), first.failed) == (2, ["a.png", "b.png"], {})
+
+
 def test_of_another_mask_the_result_is_another(tmp_path: Path) -> None:
     picture, mask = save(tmp_path / "a.png"), tmp_path / "mask.png"
     for columns, kept, failed in ((4, 0, False), (4, 1, False), (8, 0, True)):

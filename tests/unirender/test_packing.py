@@ -259,7 +259,7 @@ def test_members_that_do_not_stand_together_are_named(tmp_path: Path) -> None:
         list(read_groups(tmp_path / "shard-000000.tar"))
 
 
-@pytest.mark.parametrize("end", ["emptied", "gone", "cut"])
+@pytest.mark.parametrize("end", ["emptied", "others", "gone", "cut", "without content", "of another kind"])
 def test_a_damaged_cache_is_named(tmp_path: Path, end: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "cache"))
     write_shard(tmp_path / "shard-000000.tar", {"a": members()})
@@ -267,10 +267,14 @@ def test_a_damaged_cache_is_named(tmp_path: Path, end: str, monkeypatch: pytest.
     (index,) = (tmp_path / "cache").rglob("index.json")
     if end == "emptied":
         index.write_text("")
+    elif end == "others":
+        index.write_text('[{"key": "a"}]')
     elif end == "gone":
         (index.parent / "pixels.npy").unlink()
     else:
-        (index.parent / "pixels.npy").write_bytes((index.parent / "pixels.npy").read_bytes()[:200])
+        data = (index.parent / "pixels.npy").read_bytes()
+        damaged = {"cut": data[:200], "without content": b"", "of another kind": data.replace(b"{", b"(", 1)}
+        (index.parent / "pixels.npy").write_bytes(damaged[end])
     with pytest.raises(UnirenderError, match=r"packed/.*: this folder of the cache is damaged \(.*\); delete it"):
         GroupDataset(tmp_path)
 

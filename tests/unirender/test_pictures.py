@@ -26,7 +26,7 @@ from unirender.picture_files.display_files import (
     srgb_values_and_remarks,
     stored_values,
 )
-from unirender.pictures import read_mask, read_picture
+from unirender.pictures import header_pixels, read_mask, read_picture
 from unirender.pipelines.inputs import as_mask, as_picture
 
 RNG = np.random.default_rng(0)
@@ -451,6 +451,18 @@ def test_what_a_file_is_that_cannot_be_read(data: bytes, told: str, tmp_path: Pa
     (tmp_path / "a.jpg").write_bytes(data)
     with pytest.raises(UnirenderError, match=rf"a\.jpg: {told}.*, expected PNG, JPG.*; save it as PNG \(linear"):
         read_picture(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("suffix", ["qoi", "avif"])
+def test_a_damaged_picture_of_a_rarer_format_is_told(suffix: str, tmp_path: Path) -> None:
+    """Pillow raises an `IndexError` or a `RuntimeError` for these."""
+    path = tmp_path / f"a.{suffix}"
+    Image.fromarray(RNG.integers(0, 256, (8, 8, 3), dtype=np.uint8)).save(path)
+    for kept in (0.5, 0.9):
+        path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
+        header_pixels(path)  # says nothing
+        with pytest.raises(UnirenderError, match=rf"a\.{suffix}: not a readable picture .*; save it as PNG"):
+            read_picture(path)
 
 
 def test_what_cannot_be_opened_is_told_in_words(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from unirender.exr import exr_bytes, intrinsics_channels
 from unirender.intrinsics import Intrinsics
 from unirender.light.lobes import texel_directions
 from unirender.models.visibility import CLASSES, VisibilityNet, bin_weights
+from unirender.system.whole_files import file_sha256
 from unirender.training.loop import checkpoint
 from unirender.training.loop.checkpoint import load_state
 from unirender.training.shadows.command import TrainVisibility, rate, split, train_visibility
@@ -128,9 +129,31 @@ def test_a_folder_is_looked_at_once(folder: Path, caplog: pytest.LogCaptureFixtu
 
 
 def test_a_shard_of_pictures_is_refused(tmp_path: Path) -> None:
-    write_shard(tmp_path / "shard-000000.tar", {"a": {"shared.exr": b"", "json": b"{}"}})
+    path = tmp_path / "shard-000000.tar"
+    write_shard(path, {"a": {"shared.exr": b"", "json": b"{}"}})
     with pytest.raises(UnirenderError, match="--vary visibility"):
-        _prepare(tmp_path / "shard-000000.tar", "")  # in this process: none to start
+        _prepare(path, file_sha256(path))  # in this process: none to start
+
+
+def test_a_damaged_shard_of_rays_is_refused(tmp_path: Path, folder: Path) -> None:
+    path = tmp_path / "shard-000000.tar"
+    whole = (folder / path.name).read_bytes()
+    path.write_bytes(whole.replace(b"NUMPY\x01", b"NUMPY\x09", 1))
+    with pytest.raises(UnirenderError, match=r"shard-000000\.tar: sha256 is .*, the manifest says"):
+        _prepare(path, file_sha256(folder / path.name))
+    with pytest.raises(UnirenderError, match=r"group ball0\.visible\.npy: cannot be read .*; remake the shard"):
+        _prepare(path, file_sha256(path))
+
+
+@pytest.mark.parametrize("kept", [0, 300])
+def test_damaged_rays_of_the_cache_are_named(tmp_path: Path, kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UNIRENDER_CACHE", str(tmp_path / "cache"))
+    path = write_rays(tmp_path / "rays", "ball") / "shard-000000.tar"
+    _prepare(path, file_sha256(path))
+    (stored,) = (tmp_path / "cache").rglob("items.npz")
+    stored.write_bytes(stored.read_bytes()[:kept])
+    with pytest.raises(UnirenderError, match=r"this folder of the cache is damaged \(.*\); delete it"):
+        read_items(path.parent)
 
 
 def test_the_loss_is_that_of_the_equations() -> None:

@@ -107,8 +107,8 @@ def read_array(path: Path, channels: int) -> Float[np.ndarray, "h w c"]:
     """
     try:
         found = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise UnirenderError(f"{path}: not a readable NumPy array ({error}); copy it again") from error
+    except Exception as error:  # NumPy raises half a dozen kinds for a damaged file
+        raise UnirenderError(f"{path}: not a readable NumPy array ({error!s:.200}); copy it again") from error
     value = found[..., None] if getattr(found, "ndim", 0) == 2 else found
     if getattr(value, "ndim", 0) != 3 or value.shape[-1] != channels or value.dtype.kind not in "fiu":
         shape = getattr(found, "shape", type(found).__name__)

@@ -165,8 +165,8 @@ def measured(colours: Path, mask: Path) -> tuple[Float[np.ndarray, "k 3"], Integ
     """
     try:
         adobe = np.load(colours, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise UnirenderError(f"{colours}: not a readable NumPy array ({error}); copy it again") from error
+    except Exception as error:  # NumPy raises half a dozen kinds for a damaged file
+        raise UnirenderError(f"{colours}: not a readable NumPy array ({error!s:.200}); copy it again") from error
     if not isinstance(adobe, np.ndarray):
         raise UnirenderError(f"{colours}: is an archive of arrays, expected one array of (k, 3)")
     if adobe.ndim != 2 or adobe.shape[1] != 3 or adobe.dtype.kind not in "fiu" or not np.isfinite(adobe).all():

@@ -23,13 +23,14 @@ MOST_HEADER_BYTES = 2**16
 RGBE_TURNED = re.compile(rb"#\?.*?\n\n(?!-Y \d+ \+X )([-+][XY] \d+ [-+][XY] \d+)\s*\n", re.DOTALL)
 OLD_RUNS = "its pixels are run-length coded as Radiance did before 1991"
 NEW_RUNS = b"\2\2"  # how rows begin that are coded as since then
+CODED_ROW, CODED_COLUMNS = re.compile(NEW_RUNS + rb"[\0-\x7f]"), range(8, 0x8000)  # so many columns can be coded
 XYZE = "32-bit_rle_xyze"  # Mitsuba takes its white for one of D65, which Radiance's is not
 HEADER_NUMBERS = {  # how many, and what
     "EXPOSURE": (1, "a number above 0"),
     "COLORCORR": (3, "three numbers above 0"),
     "PRIMARIES": (8, "x, y of red, green, blue and white"),
 }
-SIZES = re.compile(rb"#\?.*?\n-Y (\d+) \+X (\d+)\s*\n|P[Ff]\s+(\d+)\s+(\d+)\s", re.DOTALL)  # of RGBE, of PFM
+SIZES = re.compile(rb"#\?.*?\n-Y +(\d+) +\+X +(\d+)\s*\n|P[Ff]\s+(\d+)\s+(\d+)\s", re.DOTALL)  # of RGBE, of PFM
 
 
 def read_radiance(path: Path) -> Float[np.ndarray, "h w 3"]:
@@ -52,8 +53,11 @@ def read_radiance(path: Path) -> Float[np.ndarray, "h w 3"]:
                 f"light {path}: its pixels are stored as {turned[1].decode()!r}, expected '-Y height +X width' (from "
                 "the top left, by rows); write the file again"
             )
+        _check_rows(path)
         bitmap = mi.Bitmap(str(path)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, srgb_gamma=False)
-    except (OSError, RuntimeError) as error:
+    except UnirenderError:
+        raise
+    except (OSError, RuntimeError, ValueError) as error:  # ValueError: of a size that is no number
         reason = OLD_RUNS if _has_old_runs(path) else str(error).strip().splitlines()[-1]
         raise UnirenderError(
             f"light {path}: not a readable HDR map ({reason}), expected RGBE, PFM or EXR; save it as EXR"
@@ -83,6 +87,36 @@ def _has_old_runs(path: Path) -> bool:
     digit = place - np.maximum.accumulate(np.where(run, -1, place)) - 1  # of a count, from the lowest
     lengths = np.where(run, pixels[:, 3] * 256.0 ** np.minimum(digit, 4), 1)
     return bool(run.any() and lengths.sum() == int(header[1]) * int(header[2]))
+
+
+def _check_rows(path: Path) -> None:
+    """Looks whether each row of a Radiance file begins where the one above ends. Where one does not, Mitsuba takes the
+    rest for pixels that are not coded, and writes them beyond the end of its picture.
+
+    Raises:
+        UnirenderError: one does not, or the header has no size.
+    """
+    data = path.read_bytes()
+    if not data.startswith(b"#?"):
+        return
+    header = SIZES.match(data[:MOST_HEADER_BYTES])
+    if header is None:
+        raise UnirenderError(f"light {path}: its header has no size, expected '-Y height +X width'; write it again")
+    rows, columns, place = int(header[1]), int(header[2]), header.end()
+    if columns not in CODED_COLUMNS or not CODED_ROW.match(data, place):
+        return
+    for row in range(1, rows + 1):
+        if not CODED_ROW.match(data, place):
+            raise UnirenderError(
+                f"light {path}: row {row} of {rows} does not begin where the one above ends: the file is damaged or "
+                "cut off; copy it again"
+            )
+        place += 4
+        left = 4 * columns  # bytes of the row
+        while left > 0 and place < len(data):
+            code = data[place]
+            left -= code & 127 if code > 128 else code
+            place += 2 if code > 128 else 1 + code
 
 
 def _as_its_header_says(pixels: Float[np.ndarray, "h w 3"], path: Path) -> Float[np.ndarray, "h w 3"]:

@@ -2,13 +2,13 @@
 
 import contextlib
 import json
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from unirender.errors import UnirenderError, UsageError
+from unirender.new_folders import new_folder
 from unirender.system.wording import counted
 from unirender.system.writing import writing
 from unirender_reference.output_files import ELSEWHERE, check_file, png_bytes, write_file
@@ -186,13 +186,8 @@ def _new_folder(path: Path | None) -> Iterator[Path | None]:
     if path is None:
         yield None
         return
-    with writing(f"--export {path}", ELSEWHERE):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as scratch:
-            folder = Path(scratch) / path.name
-            folder.mkdir()
-            yield folder
-            folder.rename(path)
+    with writing(f"--export {path}", ELSEWHERE), new_folder(path) as folder:
+        yield folder
 
 
 def _export(folder: Path, light: "Light") -> None:

@@ -13,6 +13,7 @@ from unirender.errors import UnirenderError
 
 HALF_MADE = ".*.????????"  # folders of `cached_folder`
 HALF_WRITTEN = re.compile(r"\.(.+)\.[0-9a-f]{12}")  # folders of `new_folders.new_folder`
+REPLACED = re.compile(r"\.(.+)\.old\.[a-z0-9_]{8}")  # folders of `whole_files.move_into_place`
 FORGOTTEN_S = 24 * 3600.0  # seconds after which nobody is still writing to one: it takes minutes
 
 
@@ -62,15 +63,19 @@ def cached_folder(folder: Path) -> Iterator[Path]:
 def forget_half_made(parent: Path, names: Collection[str]) -> None:
     """Deletes the temporary folders of `new_folders.new_folder(parent / name)` that a killed process left, after a day.
 
-    Nothing in a folder that may be written to but not listed, as one is that others hand in to.
+    Of an earlier result that it was about to replace, only where there is another now. Nothing in a folder that may be
+    written to but not listed, as one is that others hand in to.
     """
     try:
         beside = list(parent.iterdir())
     except OSError:
         return
     for path in beside:
-        found = HALF_WRITTEN.fullmatch(path.name)
-        if found is not None and found[1] in names and not path.is_symlink():
+        replaced = REPLACED.fullmatch(path.name)
+        found = replaced or HALF_WRITTEN.fullmatch(path.name)
+        if found is None or found[1] not in names or path.is_symlink():
+            continue
+        if replaced is None or (parent / found[1]).is_dir():
             _forget(path)
 
 

@@ -119,4 +119,8 @@ def move_into_place(temporary: Path, path: Path) -> None:
         os.rename(before / "old", path)
         before.rmdir()
         raise
-    shutil.rmtree(before)
+    try:
+        shutil.rmtree(before)
+    except BaseException:  # a signal: the new folder is in place, and the old one goes all the same
+        shutil.rmtree(before, ignore_errors=True)
+        raise

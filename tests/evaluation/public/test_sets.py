@@ -20,7 +20,7 @@ from unirender.exr import image_channels, write_exr
 from unirender.intrinsics import Intrinsics
 from unirender.light.environment import environment_directions, sample_environment
 from unirender_evaluation.metrics import Variant, metric_key
-from unirender_evaluation.public.files import PublicSetError, block_mean, shrunk
+from unirender_evaluation.public.files import PublicSetError, block_mean, read_array, shrunk
 from unirender_evaluation.public.iiw import Iiw
 from unirender_evaluation.public.maw import Maw, adobe_to_rec709, measured
 from unirender_evaluation.public.metrics import COSINE_DISTANCE, PSNR_H, PSNR_L
@@ -387,6 +387,16 @@ def test_maw_refuses_colours_out_of_range(tmp_path: Path, value: float) -> None:
     assert len(Maw(folder).samples()) == 1
     np.save(path, np.array([[0, 1, 0], [0.6, 0.6, 1]]))  # outside Rec.709, and clipped
     assert measured(path, path.with_name("DSC1_mask.png"))[0][0] == pytest.approx([0, 1, 0], abs=2e-4)
+
+
+def test_an_array_with_a_damaged_header_is_told(tmp_path: Path) -> None:
+    """NumPy raises a `TokenError` here."""
+    folder = make_maw(tmp_path)
+    path = folder / "labels/colors/DSC1.npy"
+    path.write_bytes(path.read_bytes().replace(b"{", b"(", 1))
+    assert f"{path}: not a readable NumPy array" in problems(Maw(folder))
+    with pytest.raises(UnirenderError, match=r"DSC1\.npy: not a readable NumPy array .*; copy it again"):
+        read_array(path, 3)
 
 
 def test_a_photograph_of_another_colour_space_is_seen_in_srgb(tmp_path: Path) -> None:

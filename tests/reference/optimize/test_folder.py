@@ -413,6 +413,8 @@ BAD = {
     ),
     "split as text": (broken(lambda c: c.update(test_filenames="images/0000.png")), "test_filenames is 'images/0000"),
     "focal 0": (first(fl_x=0, fl_y=0), "expected one positive focal length"),
+    "endless focal": (first(fl_x=10**400), "fl_x is 1000.*, expected a finite number"),
+    "endless pose": (first(transform_matrix=[[10**400] * 4] * 4), "transform_matrix is no 4 x 4 matrix"),
     "focal text": (first(fl_x="long"), "fl_x is 'long', expected a finite number"),
     "oblong pixels": (first(fl_x=40.0, fl_y=30.0), "square pixels"),
     "slightly oblong pixels": (first(fl_x=40.0, fl_y=39.8), "square pixels"),

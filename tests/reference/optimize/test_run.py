@@ -268,9 +268,13 @@ def test_a_broken_state_is_one_sentence(tmp_path: Path):
     assert isinstance(back, Solution)
     for name in ("vertices", "faces", "normals", "uv", "albedo", "roughness", "metallic"):
         np.testing.assert_array_equal(getattr(back.obj, name), getattr(truth().obj, name))
-    path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(UnirenderError, match="no readable state"):
-        read_solution_file(path)
+    whole = path.read_bytes()
+    long_name = whole[:26] + b"\xff\x7f" + whole[28:]  # of the first array, which zipfile quotes
+    for damaged in (whole[:500], whole.replace(b"{'descr", b"('descr"), long_name, whole[128 : whole.index(b"PK", 1)]):
+        path.write_bytes(damaged)  # the last is an array, and no archive
+        with pytest.raises(UnirenderError, match="no readable state") as told:
+            read_solution_file(path)
+        assert len(str(told.value)) < 300 + len(str(path)), "zipfile quotes what it takes for a name"
 
 
 def test_the_best_look_counts_and_patience_ends():

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +40,6 @@ def read_solution_file(path: Path) -> Solution | MeshObject:
         text = json.loads(str(arrays.pop(_TEXT)))
         environment = arrays.pop(_ENVIRONMENT, None)
         obj = MeshObject(**text, **arrays)
-    except (OSError, ValueError, TypeError, KeyError, zipfile.BadZipFile) as error:
-        raise UnirenderError(f"{path}: no readable state ({error}); delete the folder to begin anew") from error
+    except Exception as error:  # NumPy raises half a dozen kinds for a damaged file
+        raise UnirenderError(f"{path}: no readable state ({error!s:.200}); delete the folder to begin anew") from error
     return obj if environment is None else Solution(obj, environment)

@@ -14,6 +14,7 @@ A frame is held out where it says `"held_out": true`, and where the file has ner
 import json
 import math
 import os
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,7 @@ SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 DISTORTIONS = "distortion_params"  # nerfstudio's list of the same
 FOCAL = ("fl_x", "fl_y", "camera_angle_x", "camera_angle_y")  # each of them says how wide the lens is
+LARGEST = sys.float_info.max  # JSON has whole numbers beyond it
 ASPECT_TOLERANCE = 0.01  # of the proportions: whole pixels
 ANGLE_TOLERANCE = 0.02  # of a focal length beside an angle, which may count a pixel more or less
 FOCAL_TOLERANCE = 0.002  # of fl_x and fl_y: less than a pixel at the edge of 800
@@ -154,8 +156,8 @@ class PosedPicture:
 
     def _number(self, key: str, default: float) -> float:
         value = self.values.get(key, default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise UnirenderError(f"{self.name}: {key} is {value!r}, expected a finite number")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+            raise UnirenderError(f"{self.name}: {key} is {value!r:.60}, expected a finite number")
         return float(value)
 
 
@@ -245,7 +247,7 @@ def _picture_file(folder: Path, name: str, where: str) -> Path:
 def _pose(entry: Mapping[str, Any], where: str) -> Float[np.ndarray, "4 4"]:
     try:
         pose = np.asarray(entry.get("transform_matrix"), np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pose = np.zeros(0)
     if pose.shape == (3, 4):
         pose = np.concatenate([pose, [[0, 0, 0, 1]]])

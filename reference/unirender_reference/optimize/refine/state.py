@@ -1,7 +1,6 @@
 """Where a refinement stands: maps, moments and the iteration, in memory and in a file."""
 
 import dataclasses
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,9 +77,9 @@ class RefineState:
         try:
             with np.load(path) as file:
                 arrays = {name: file[name] for name in file.files}
-        except (OSError, ValueError, zipfile.BadZipFile) as error:
+        except Exception as error:  # NumPy raises half a dozen kinds for a damaged file
             raise UnirenderError(
-                f"{path}: no readable state of a refinement ({error}); delete it to begin anew"
+                f"{path}: no readable state of a refinement ({error!s:.200}); delete it to begin anew"
             ) from error
         found, expected = ({name: array.shape for name, array in own.items()} for own in (arrays, state._arrays()))
         for name in sorted({*found, *expected}):

@@ -91,7 +91,7 @@ def split_of(folder: str | Path) -> str | None:
     """
     sides: dict[str, list[str]] = {}
     for part in _parts(Path(folder)):
-        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # shards of one's own need no manifest
+        with contextlib.suppress(OSError, ValueError, LookupError, TypeError, RecursionError):  # one's own need none
             side = json.loads((part / "manifest.json").read_text())["config"]["split"]
             sides.setdefault(str(side), []).append(part.name)
     if len(sides) > 1:
@@ -126,10 +126,10 @@ def _own_shards(folder: Path) -> dict[Path, str | None]:
         try:
             journal = _journal_entries(folder / "shards.jsonl")  # first: the manifest takes its lines over
             entries = journal + json.loads(manifest.read_text())["shards"]
-            listed = {entry["name"]: entry["sha256"] for entry in entries}
-            sizes = {entry["name"]: int(entry["bytes"]) for entry in entries if "bytes" in entry}
-            empty = {entry["name"] for entry in entries if entry.get("groups") == 0}
-        except (ValueError, KeyError, TypeError) as error:
+            listed = {str(entry["name"]): str(entry["sha256"]) for entry in entries}
+            sizes = {str(entry["name"]): int(entry["bytes"]) for entry in entries if "bytes" in entry}
+            empty = {str(entry["name"]) for entry in entries if entry.get("groups") == 0}
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             raise UnirenderError(f"{manifest}: not a readable manifest ({error!r}); remake the dataset") from error
     present = {path.name: path for path in sorted(folder.glob("*.tar"))}
     missing = sorted(set(listed) - set(present))
@@ -231,12 +231,22 @@ def open_packed(path: str | Path, sha256: str | None = None, name: str | None = 
     known = sha256 or file_sha256(path)
     folder = cache_dir() / "packed" / f"{known}-v{PACK_VERSION}"
     if not folder.exists():
-        if sha256 is not None and (actual := file_sha256(path)) != sha256:
-            raise UnirenderError(
-                f"{path}: sha256 is {actual}, the manifest says {sha256}; delete the shard and remake the dataset"
-            )
+        if sha256 is not None:
+            check_sha256(path, sha256)
         _pack(path, folder)
     return _open(folder, name or path.name, known)
+
+
+def check_sha256(path: Path, sha256: str) -> None:
+    """Looks whether a shard is what its manifest says.
+
+    Raises:
+        UnirenderError: it is another, or cannot be read.
+    """
+    if (actual := file_sha256(path)) != sha256:
+        raise UnirenderError(
+            f"{path}: sha256 is {actual}, the manifest says {sha256}; delete the shard and remake the dataset"
+        )
 
 
 def _open(folder: Path, name: str, sha256: str) -> Shard:
@@ -247,7 +257,7 @@ def _open(folder: Path, name: str, sha256: str) -> Shard:
             Group(**{**group, "pairs": tuple(Pair(**pair) for pair in group["pairs"])})
             for group in json.loads((folder / "index.json").read_text())
         )
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise damaged(folder, error) from error
     return Shard(folder=folder, name=name, sha256=sha256, groups=groups, **arrays)
 
@@ -260,7 +270,7 @@ def mapped(path: Path) -> np.ndarray:
     """
     try:
         return np.asarray(np.load(path, mmap_mode="r"))
-    except (OSError, ValueError) as error:
+    except Exception as error:  # NumPy raises half a dozen kinds for a broken header, and another for an empty file
         raise damaged(path.parent, error) from error
 
 
@@ -279,7 +289,9 @@ def store(path: Path, array: np.ndarray) -> None:
 
 def damaged(folder: Path, error: Exception) -> UnirenderError:
     """What is said of a folder of the cache that is not what was written."""
-    return UnirenderError(f"{folder}: this folder of the cache is damaged ({error}); delete it, it is then made again")
+    return UnirenderError(
+        f"{folder}: this folder of the cache is damaged ({error!s:.200}); delete it, it is then made again"
+    )
 
 
 def _pack(path: Path, folder: Path) -> None:

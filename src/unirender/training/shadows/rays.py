@@ -28,7 +28,7 @@ from unirender.system.paths import cache_dir, cached_folder
 from unirender.system.whole_files import file_sha256
 from unirender.system.worker_pool import WorkerPool
 from unirender.training.data.derived import one_thread
-from unirender.training.data.groups import list_shards, read_groups, split_of
+from unirender.training.data.groups import check_sha256, damaged, list_shards, read_groups, split_of
 from unirender.training.data.same_objects import object_of
 
 VERSION = 1  # part of the cache's path: raise it when the masks or the bins change
@@ -104,7 +104,7 @@ def read_items(
         progress: called with (shards looked at, shards in all).
 
     Raises:
-        UnirenderError: no such folder, shards of another kind, or some for training and some for tests.
+        UnirenderError: no such folder, shards of another kind or damaged, or some for training and some for tests.
     """
     folder = Path(folder)
     split_of(folder)
@@ -162,6 +162,7 @@ def _place(sha256: str) -> Path:
 
 def _prepare(path: Path, sha256: str) -> None:
     """Looks at the objects of a shard; its folder appears when all are done."""
+    check_sha256(path, sha256)
     arrays = {}
     for key, members in read_groups(path):
         if "visible.npy" not in members:
@@ -171,7 +172,12 @@ def _prepare(path: Path, sha256: str) -> None:
             )
         channels, _ = read_exr_bytes(members["shared.exr"], name=f"{path}: group {key}.shared.exr")
         normal, mask = channels_rgb(channels, "normal", "XYZ"), channels_rgb(channels, "mask", "Y")
-        visible = np.unpackbits(np.load(io.BytesIO(members["visible.npy"])), axis=1).astype(bool)
+        try:
+            visible = np.unpackbits(np.load(io.BytesIO(members["visible.npy"])), axis=1).astype(bool)
+        except Exception as error:  # NumPy raises half a dozen kinds for a damaged file
+            raise UnirenderError(
+                f"{path}: group {key}.visible.npy: cannot be read ({error!s:.200}); remake the shard"
+            ) from error
         if (item := look_at(normal, mask, Camera(), visible)) is not None:
             arrays |= {f"{key}/{name}": getattr(item, name) for name in _FIELDS}
     with cached_folder(_place(sha256)) as made:
@@ -182,10 +188,13 @@ _FIELDS = ("normal", "surface", "depth", "weight", "hidden")
 
 
 def _stored(place: Path) -> list[VisibilityItem]:
-    with np.load(place / "items.npz") as arrays:
-        keys = dict.fromkeys(name.rsplit("/", 1)[0] for name in arrays.files)
-        maps = {key: {name: arrays[f"{key}/{name}"] for name in _FIELDS} for key in keys}
-        return [VisibilityItem(**own, object=object_of(key)) for key, own in maps.items()]
+    try:
+        with np.load(place / "items.npz") as arrays:
+            keys = dict.fromkeys(name.rsplit("/", 1)[0] for name in arrays.files)
+            maps = {key: {name: arrays[f"{key}/{name}"] for name in _FIELDS} for key in keys}
+    except Exception as error:  # NumPy raises half a dozen kinds for a damaged file
+        raise damaged(place, error) from error
+    return [VisibilityItem(**own, object=object_of(key)) for key, own in maps.items()]
 
 
 def _pooled(values: np.ndarray) -> Float[np.ndarray, "h w c"]:
