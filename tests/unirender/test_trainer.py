@@ -507,6 +507,11 @@ def test_a_run_that_is_taken_up_again_says_where_it_stands(tmp_path: Path) -> No
         "resumed at step 1 of 2",
         "finished at step 2 of 2: nothing to train; pass --steps (more than 2) to go on from there",
     ]
+    state = load_state(tmp_path)
+    assert state is not None
+    save_state(tmp_path, state | {"seconds": 330.0})
+    Trainer(TRAIN, RunConfig(tmp_path, minutes=5.0), CPU, torch.float32).fit(SyntheticSource(), say=said.append)
+    assert said[-1].startswith("finished at step 2, after 5.5 of 5 minutes: nothing to train")
     assert standing(7, 1.25, None, 5.0) == "resumed at step 7, after 1.2 of 5 minutes"
     both = standing(8, 5.5, 8, 5.0)
     assert both.startswith("finished at step 8 of 8, after 5.5 of 5 minutes: nothing to train")
