@@ -518,7 +518,6 @@ def test_a_folder_says_which_picture_and_which_option(
 
 BAD = {  # after `decompose`, and what the line must say; of a picture's own faults tests/unirender/test_pictures.py
     "text": (["IN/text.png"], "not a readable picture"),
-    "missing": (["IN/missing.png"], "no such file"),
     "empty folder": (["IN"], "has no pictures"),
     "frames": (["BALL", "--frames"], "is no folder"),
     "mask size": (["BALL", "--mask", "IN/.mask.png"], "expected 150 x 100"),
@@ -659,8 +658,6 @@ def test_too_little_memory_is_no_internal_error(error: Exception, capsys: pytest
 
 
 USAGE = {
-    "no argument": (["decompose"], "required"),
-    "no such command": (["bake"], "bake"),
     "nothing to change": (["edit", "PICTURE", "--output", "OUT"], "nothing to change"),
     "metallic": (["edit", "PICTURE", "--output", "OUT", "--metallic", "nan"], "[0, 1]"),
     "fov": (["decompose", "PICTURE", "--output", "OUT", "--fov", "190"], "--fov 190: expected degrees"),
@@ -686,7 +683,6 @@ FAILURES = {
     "picture": (["edit", "MISSING", "--output", "OUT", "--roughness", "0.5"], "no such file"),
     "folder of pictures": (["edit", "FOLDER", "--output", "OUT", "--roughness", "0.5"], "is a folder"),
     "light": (["relight", "PICTURE", "--environment", "MISSING", "--output", "OUT"], "missing"),
-    "maps": (["render", "FOLDER", "--output", "OUT"], "intrinsics.exr"),
     "no maps": (["render", "PICTURE", "--output", "OUT"], "no EXR file"),
     "incomplete maps": (["render", "MAPS", "--output", "OUT"], "normal, roughness, metallic missing"),
     "checkpoint": (

@@ -245,6 +245,9 @@ def test_pictures_carry_the_mask_as_alpha() -> None:
     assert levels.shape == (SIZE, SIZE, 4)
     assert levels[..., 0].min() == levels[..., 0].max() == 64
     np.testing.assert_array_equal(levels[..., 3], np.round(mask()[..., 0] * 255))
+    (card,) = shelves([item("x")], RUN, {}, SIZE)[0]["cards"]
+    shown = Image.open(io.BytesIO(base64.b64decode(card["truth"][0]["uri"].partition(",")[2])))
+    np.testing.assert_array_equal(np.asarray(shown)[..., 3], levels[..., 3])
 
 
 def test_display_pictures_of_maps() -> None:

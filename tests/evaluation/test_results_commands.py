@@ -17,6 +17,8 @@ from unirender_evaluation.results.compare import Rank, chosen_pairs, compare_pai
 from unirender_evaluation.results.listing import LISTINGS, METHOD_GROUPS
 from unirender_evaluation.runs.config import GROUPS
 from unirender_evaluation.statistics import paired_difference
+from unirender_evaluation.suites.home import found_spec
+from unirender_evaluation.suites.spec import suite_path
 from unirender_evaluation.table_list import ALL_TABLES
 
 KEY = "albedo.psnr@masked-srgb-raw"
@@ -52,6 +54,8 @@ def test_ls_names_everything(bench) -> None:
         assert name in out
     assert all(f"{name}\n" in out for name in LISTINGS)
     assert all(spec in out for spec in ALL_TABLES)
+    tiny = found_spec(suite_path("tiny"))
+    assert f"  truth {tiny.truth_sha256[:12]}: {tiny.truth_path}\n" in out
     status, out, _ = bench("ls", "variants")
     assert (status, out.splitlines()[0]) == (0, "variants")
     assert bench("ls", "suits")[0] == 2

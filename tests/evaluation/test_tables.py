@@ -460,6 +460,13 @@ def test_latex_is_balanced_booktabs() -> None:
     assert not re.search(r"[±†·∞↑↓]", text)
 
 
+def test_latex_has_the_best_in_bold_and_the_second_underlined() -> None:
+    lines = [line.split(" & ") for line in to_latex(table("masked")).splitlines() if " & " in line]
+    albedo = {label.strip(): cell for label, cell, *_ in lines}
+    starts = {"Ours (mean)": r"\textbf{21.15}", "Input as albedo": r"\underline{12.15}", "Noise ceiling": "45.15"}
+    assert {label: albedo[label].split(" {")[0] for label in starts} == starts
+
+
 def named(label: str, note: str = "") -> Table:
     """The masked inverse table of one stranger's row."""
     records = [replace(record, method="theirs") for record in inverse("ours")]

@@ -8,6 +8,7 @@ from tiny_models import make_pipeline
 from unirender.color import image_srgb
 from unirender.composite import composite_image
 from unirender.intrinsics import Intrinsics
+from unirender.pipelines.closure import MAX_GAIN
 from unirender.pipelines.flat_albedo import flattened, patterned, with_flat_albedo
 from unirender.pipelines.framing import Frame
 
@@ -76,6 +77,20 @@ def test_what_the_albedo_loses_goes_into_the_light() -> None:
     assert all(np.all(gain[MASK[..., 0] == 0] == 1) for gain in gains)
     for name in ("metallic", "mask"):
         np.testing.assert_array_equal(old[name], new[name])
+
+
+@pytest.mark.parametrize(("point", "ground", "gain"), [(0.0, 0.9, 1 / MAX_GAIN), (0.05, 0.0, MAX_GAIN)])
+def test_the_light_of_a_point_that_goes_changes_within_bounds(point: float, ground: float, gain: float) -> None:
+    """Of a black one nothing would be left of the ratio, and a bright one on black would make a lamp."""
+    size = 2 * SIZE
+    albedo = np.full((size, size, 3), ground, np.float32)
+    albedo[SIZE, SIZE] = point
+    before = maps(albedo, np.ones((size, size, 1), np.float32))
+    before = before.replace(metallic=np.ones((size, size, 1), np.float32))
+    after = with_flat_albedo(before, composite_image(before), Frame(size, size, size))
+    for name in ("specular", "diffuse"):
+        found = after.require(name)[name] / before.require(name)[name]
+        np.testing.assert_allclose(found[SIZE, SIZE], gain, rtol=1e-6)
 
 
 def test_an_even_albedo_stays_and_what_lies_outside_the_object_does_not_matter() -> None:

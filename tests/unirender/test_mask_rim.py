@@ -83,6 +83,14 @@ def test_a_soft_matte_stays_as_it_is() -> None:
     np.testing.assert_array_equal(cleaned[:, 9], picture[:, 7])
 
 
+def test_the_nearest_pixel_of_the_object_may_be_the_pictures_last() -> None:
+    mask, image = np.zeros((8, 8, 1), np.float32), np.full((8, 8, 3), 0.9, np.float32)
+    mask[-2], mask[-1], image[-1] = 0.5, 1, 0.2
+    for turns in range(4):  # the last row, the last column, and the first of both
+        turned = without_background(np.rot90(image, turns).copy(), np.rot90(mask, turns).copy())
+        assert (np.rot90(turned, -turns)[-2:] == np.float32(0.2)).all()
+
+
 def hard(radius: float) -> Float[np.ndarray, "h w 1"]:
     """All 0 or 1."""
     rows, columns = np.mgrid[:SIDE, :SIDE] + 0.5 - SIDE / 2

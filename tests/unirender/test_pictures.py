@@ -32,14 +32,6 @@ from unirender.pipelines.inputs import as_mask, as_picture
 RNG = np.random.default_rng(0)
 
 
-def test_display_picture_keeps_its_values(tmp_path: Path) -> None:
-    pixels = RNG.integers(0, 256, (5, 7, 3), dtype=np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "a.png")
-    picture = read_picture(tmp_path / "a.png")
-    assert picture.mask is None
-    np.testing.assert_array_equal(np.round(picture.image_srgb * 255), pixels)
-
-
 def test_alpha_becomes_the_mask_and_palettes_are_understood(tmp_path: Path) -> None:
     rgba = RNG.integers(0, 256, (4, 4, 4), dtype=np.uint8)
     rgba[0, 0, 3] = 255
@@ -60,12 +52,6 @@ def test_a_palette_of_rgba_keeps_its_alpha() -> None:
     np.testing.assert_array_equal(as_picture(palette)[1], as_picture(rgba)[1])
     palette.info["icc_profile"] = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     np.testing.assert_array_equal(as_picture(palette)[1], as_picture(rgba)[1])
-
-
-def test_sixteen_bit_grey(tmp_path: Path) -> None:
-    values = np.array([[0, 32768, 65535]], dtype=np.uint16)
-    Image.fromarray(values).save(tmp_path / "a.png")
-    np.testing.assert_allclose(read_picture(tmp_path / "a.png").image_srgb[0, :, 1], [0, 0.5, 1], atol=1e-4)
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])

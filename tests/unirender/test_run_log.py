@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from unirender.training.logs.run_log import RunLog, read_lines
+from unirender.training.logs.run_log import OVERFLOW, RunLog, read_lines
 from unirender.training.optim.processes import ALONE, Processes
 
 LINES = '{"step": 1, "image": 2.0}\n', '{"step": 2, "image": 1.5}\n', '{"step": 3, "image": 1.0}\n'
@@ -30,6 +30,16 @@ def test_what_holds_from_the_state_on_is_told_anew(tmp_path: Path) -> None:
     log.path.write_text(before + '{"step": 2, "data": "2 -> 3"}\n{"step": 2, "parts": "1 -> 2"}\n')
     log.forget_after(2)
     assert log.path.read_text() == before
+
+
+def test_a_value_is_its_mean_over_steps_and_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And light above the curves is told of only where there is some."""
+    log = RunLog(tmp_path, Processes(rank=0, size=2))
+    monkeypatch.setattr(Processes, "gather", lambda self, own: [own, own | {"image": 7.0}])
+    log.add({"image": 1.0, f"{OVERFLOW}diffuse": 0.0, f"{OVERFLOW}specular": 0.5})
+    log.add({"image": 2.0, f"{OVERFLOW}diffuse": 0.0, f"{OVERFLOW}specular": 0.0})
+    assert log.means() == {"image": (1.5 + 7) / 2, f"{OVERFLOW}specular": 0.25}
+    assert log.means() == {}
 
 
 def test_a_run_without_a_log_has_no_lines(tmp_path: Path) -> None:

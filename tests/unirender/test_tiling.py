@@ -200,3 +200,6 @@ def test_many_tiles_are_told() -> None:
     assert frame_remarks(mask, 32, tile=True)["tile"].startswith(f"--tile: {count} tiles of 32 pixels")
     assert not frame_remarks(mask, 32, tile=False)
     assert not frame_remarks(mask[:200], 32, tile=True)
+    whole = np.ones((33, 32, 1), np.float32)
+    assert "adds nothing" in frame_remarks(whole[:32], 32, tile=True)["tile"]  # of the network's own size
+    assert not frame_remarks(whole, 32, tile=True)

@@ -37,7 +37,7 @@ from unirender.training.data import dataset as data_module
 from unirender.training.data import reader
 from unirender.training.data.reader import BatchReader
 from unirender.training.data.source import ShardSource
-from unirender.training.logs.live import live_report, never_at_peak, standing
+from unirender.training.logs.live import live_report, never_at_peak, progress_line, standing
 from unirender.training.logs.run_log import read_lines
 from unirender.training.loop.checkpoint import (
     STATE_FILE,
@@ -290,7 +290,9 @@ def test_validation_sees_the_averaged_weights(tmp_path: Path) -> None:
     trainer = Trainer(TRAIN, RunConfig(tmp_path, steps=1, picture_minutes=0.0), CPU, torch.float32)
     lines: list[dict[str, Any]] = []
     trainer.fit(SyntheticSource(), lines.append, validate)
-    assert [line["validation"]["error"] for line in lines if "validation" in line] == [3.0, 1.0]
+    told = [line for line in lines if "validation" in line]
+    assert [line["validation"]["error"] for line in told] == [3.0, 1.0]
+    assert all(0 <= line["validation_s"] < 60 for line in told)
     weight = shown[-1].dual_stream.image_unet.conv_in.weight
     assert torch.equal(weight, trainer.ema.average["image_unet.conv_in.weight"])
     assert not torch.equal(weight, trainer.model.image_unet.conv_in.weight)  # the twin: not the trained ones
@@ -488,6 +490,14 @@ def test_a_terminal_sees_one_live_line_and_a_file_all_of_them() -> None:
     assert "\x1b[" in live  # redrawn in place
 
 
+@pytest.mark.parametrize(("step", "minutes", "share"), [(2, 1.0, 0.1), (50, 1.0, 0.5), (2, 20.0, 1.0)])
+def test_the_bar_of_a_run_shows_the_larger_share_of_its_length(step: int, minutes: float, share: float) -> None:
+    console = Console(file=io.StringIO(), no_color=True, width=100)  # draws no rest of a bar
+    console.print(progress_line({"step": step, "minutes": minutes, "samples_per_s": 90.0}, 100, 10.0))
+    assert isinstance(console.file, io.StringIO)
+    assert console.file.getvalue().count("━") == 30 * share
+
+
 def test_a_run_that_is_taken_up_again_says_where_it_stands(tmp_path: Path) -> None:
     said: list[str] = []
     for steps in (1, 2, 2):
@@ -497,6 +507,11 @@ def test_a_run_that_is_taken_up_again_says_where_it_stands(tmp_path: Path) -> No
         "resumed at step 1 of 2",
         "finished at step 2 of 2: nothing to train; pass --steps (more than 2) to go on from there",
     ]
+    state = load_state(tmp_path)
+    assert state is not None
+    save_state(tmp_path, state | {"seconds": 330.0})
+    Trainer(TRAIN, RunConfig(tmp_path, minutes=5.0), CPU, torch.float32).fit(SyntheticSource(), say=said.append)
+    assert said[-1].startswith("finished at step 2, after 5.5 of 5 minutes: nothing to train")
     assert standing(7, 1.25, None, 5.0) == "resumed at step 7, after 1.2 of 5 minutes"
     both = standing(8, 5.5, 8, 5.0)
     assert both.startswith("finished at step 8 of 8, after 5.5 of 5 minutes: nothing to train")
