@@ -99,7 +99,7 @@ def test_what_a_command_does_not_take(arguments: list[str], line: str, capsys: p
 
 @pytest.mark.parametrize(
     "arguments",
-    [["bench", "verdict", "results", "--format", "html"], ["reference", "exposure", "x", "--split", "tset"]],
+    [["bench", "verdict", "results", "--format", "html"], ["reference", "sweep", "--split", "tset"]],
 )
 def test_a_value_is_not_taken_for_a_command(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     """The choices of an option stand in braces, too."""

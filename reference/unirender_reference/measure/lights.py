@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from unirender.errors import UnirenderError, UsageError
-from unirender.new_folders import new_folder
 from unirender.system.wording import counted
 from unirender.system.writing import writing
 from unirender_reference.output_files import ELSEWHERE, check_file, png_bytes, write_file
@@ -183,6 +182,8 @@ def _alike(lights: "list[tuple[Split, Light]]") -> list[dict[str, Any]]:
 @contextlib.contextmanager
 def _new_folder(path: Path | None) -> Iterator[Path | None]:
     """A folder that appears under its name when everything is in it, or not at all."""
+    from unirender.new_folders import new_folder
+
     if path is None:
         yield None
         return
