@@ -286,7 +286,8 @@ def test_the_gauge_keeps_pictures_between_black_and_white() -> None:
         renderer = Renderer(make_object(seed, "train"), resolution=32)
         for light in (make_light(3 * seed + i, "train").environment for i in range(3)):
             lit = (light * scene_exposure(renderer, light, seed)).astype(np.float32)
-            image = renderer.image(lit, *rng.uniform(0, 1, 2), 32, batches=1).mean
+            metallic, roughness = rng.uniform(0, 1, 2)
+            image = renderer.image(lit, metallic, roughness, 32, batches=1).mean
             inside = image[image[..., 3] > 0.5]
             brightest = inside[:, :3].max(axis=1) / inside[:, 3]
             shares.append([(brightest > 1).mean(), (4 * brightest > 1).mean(), (brightest < 0.001).mean()])
