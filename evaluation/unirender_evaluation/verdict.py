@@ -19,7 +19,7 @@ from unirender_evaluation.comparisons import (
 )
 from unirender_evaluation.records import Record, RunInfo
 from unirender_evaluation.statistics import Estimate, holm, light_count, paired_p_value
-from unirender_evaluation.tables.mistakes import truth_said
+from unirender_evaluation.tables.mistakes import is_truth, truth_said
 from unirender_evaluation.task import LIGHT
 
 ORDER = ("FAILS", "open", "HOLDS", "stated")
@@ -185,11 +185,11 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, li
 
 
 def _told(records: Sequence[Record]) -> Iterator[tuple[str, str]]:
-    """Rows whose maps or lights are the truth but for rounding, with what is said of them."""
+    """Rows most of whose maps or lights are the truth but for rounding, with what is said of them."""
     by_method: dict[str, list[Record]] = {}
     for record in records:
         by_method.setdefault(record.method, []).append(record)
-    return ((method, said) for method, own in sorted(by_method.items()) if (said := truth_said(own)))
+    return ((method, truth_said(own)) for method, own in sorted(by_method.items()) if is_truth(own))
 
 
 def _place(finding: Finding) -> int:

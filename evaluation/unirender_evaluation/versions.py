@@ -149,6 +149,7 @@ NOT_IN_OPTIMIZED = (
     "files/transforms",
     "shape/misplaced",
     "shape/placement",
+    "shape/principal",
     "show/strips",
 )
 PARTS: Mapping[str, Part] = {

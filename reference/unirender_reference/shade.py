@@ -126,7 +126,7 @@ def shade_gradients(
     if image_gradient.shape != (*mask.shape[:2], 3) or not np.isfinite(image_gradient).all():
         raise UnirenderError(
             f"shade_gradients: got an image gradient of shape {image_gradient.shape}, expected finite "
-            f"{(*mask.shape[:2], 3)}, as the picture that `shade` returns; has it an alpha channel?"
+            f"{(*mask.shape[:2], 3)}, as the picture that `shade` returns; has it an alpha channel, or NaN?"
         )
     given = {**maps, "environment": light}
     totals = {name: np.zeros(given[name].shape, np.float64) for name in wrt}

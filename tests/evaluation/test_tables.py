@@ -191,7 +191,7 @@ def test_a_row_that_knows_the_truth_is_not_ranked(
     records = [
         Record(table, protocol, method, f"s{i}", f"o{i}", {key: db + 0.1 * (i % 2), **gains})
         for method, db in (methods | ({"noise-ceiling": 53.0} if quantity == "relit" else {})).items()
-        for i in range(4)
+        for i in range(12)
     ]
     kinds: dict[str, Any] = {"noise-ceiling": "ceiling"}
     run = replace(RUN, methods=tuple(MethodInfo(m, m, kinds.get(m, "external")) for m in (*methods, "noise-ceiling")))

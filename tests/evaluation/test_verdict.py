@@ -332,10 +332,18 @@ def test_what_a_stranger_shows_on_questions_of_its_choice_does_not_hold() -> Non
 
 
 def test_a_row_that_is_the_truth_fails_by_name() -> None:
-    records = [replace(r, values={**r.values, "albedo.if_shifted": -20.0}) for r in rows("a", ALBEDO, np.full(8, 60.0))]
-    said = "  FAILS  a: its answers are the truth but for rounding: albedo (8 of 8 pictures) (was it told?)\n"
-    assert said in verdict_text(records, run_of(a="external"), CHECK)
-    assert said not in verdict_text(rows("a", ALBEDO, np.full(8, 60.0)), run_of(a="reference"), CHECK)
+    def failed(true: int, others: int, kind: str = "external") -> bool:
+        records = rows("a", ALBEDO, np.array([60.0] * true + [20.0] * others))
+        if kind == "external":
+            records = [replace(r, values={**r.values, "albedo.if_shifted": -20.0}) for r in records]
+        pictures = f"albedo ({true} of {true + others} pictures)"
+        said = f"  FAILS  a: its answers are the truth but for rounding: {pictures} (was it told?)\n"
+        return said in verdict_text(records, run_of(a=kind), CHECK)
+
+    assert failed(12, 2)
+    assert not failed(8, 0)
+    assert not failed(12, 4), "it may be exact on the balls of a suite"
+    assert not failed(12, 2, "reference")
 
 
 def test_a_row_breaches_the_ceiling_where_its_interval_over_objects_does() -> None:

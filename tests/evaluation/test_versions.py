@@ -116,7 +116,7 @@ def test_what_the_optimiser_finds_needs_no_file_that_its_key_leaves_out() -> Non
             if isinstance(line, ast.ImportFrom) and line.module in left_out:
                 taken |= {alias.name for alias in line.names}
     assert taken == {
-        *("check_in_picture", "short_list", "sphere_of_masks"),
+        *("check_in_picture", "shifted_principal", "short_list", "sphere_of_masks"),
         *("read_picture_file", "write_record", "write_solution", "SOLUTION_FILE"),
         *("turntable", "views_strip"),
     }

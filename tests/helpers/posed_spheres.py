@@ -1,6 +1,7 @@
 """Objects with known shapes in front of posed cameras, for the tests of the reconstruction."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from reference_scenes import sphere
@@ -22,7 +23,11 @@ def blank_views(count: int, size: int, start_deg: float = 0.0) -> tuple[View, ..
 
 def mask_views(obj: MeshObject, count: int, size: int, start_deg: float = 0.0) -> Views:
     """Views whose masks are the object's coverage (64 rays per pixel); black pictures."""
-    blank = blank_views(count, size, start_deg)
+    return with_masks(obj, blank_views(count, size, start_deg))
+
+
+def with_masks(obj: MeshObject, blank: Sequence[View]) -> Views:
+    """The same of these cameras."""
     coverage = MeshTracer(obj.vertices, obj.faces).coverage(Cameras(blank), 8)
     masks = coverage[..., None].astype(np.float32)
     return Views(tuple(dataclasses.replace(view, mask=mask) for view, mask in zip(blank, masks, strict=True)))

@@ -23,6 +23,11 @@ def mean_luminance(environment: np.ndarray) -> float:
     return float(luminance(mean_radiance(environment)[None])[0])
 
 
+@pytest.mark.parametrize("kind", [lights.light_gradient, lights.light_softboxes, lights.light_sunsky])
+def test_synthetic_lights_are_normalised(kind):
+    assert mean_luminance(kind(3).environment) == pytest.approx(1, rel=1e-4)
+
+
 @pytest.mark.parametrize("split", ["train", "test"])
 def test_make_light_repeats_and_is_normalised(split):
     for seed in range(25):

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from unirender.errors import UnirenderError
+from unirender_evaluation.claims import CEILING
 from unirender_evaluation.comparisons import Lights, Selection, misleading_exact, over_lights, values_of
 from unirender_evaluation.metrics import DEFAULT_VARIANT, LPIPS_SCALES, PUBLISHED_VARIANT, Metric, Variant
 from unirender_evaluation.records import MethodInfo, Record, RunInfo
@@ -138,7 +139,8 @@ def build_table(
     rows = _merge(published_tables()[published_in] if published_in else (), spec, measured)
     rows = [row for row in rows if any(cell != Cell() for cell in row.cells)]
     total = max((row.n for row in rows), default=0)
-    told = told_the_truth(spec, chosen, variant)
+    asked = {CEILING, *(row.key for row in rows if row.kind == "external")}
+    told = told_the_truth(spec, [record for record in chosen if record.method in asked], variant)
     rows = _rank(spec, rows, told)
     return Table(
         name=spec.name,

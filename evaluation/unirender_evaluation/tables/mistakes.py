@@ -1,6 +1,6 @@
 """What the gains of a stranger's answers with a mistake undone say together: a sentence for the row's note."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -32,6 +32,8 @@ TRUE: tuple[tuple[str, str, Callable[[float], bool], float], ...] = (  # of maps
 MOST = 0.75  # of the pictures that say anything
 LEAST_DB = 0.1  # smaller gains say nothing, as those of a constant or of an object of one colour
 OF_ROUGHNESS = {metric_key("roughness", GAINS[name]) for name in ("if_decoded", "if_inverted", "if_root")}
+NOT_TOLD = ("roughness", "metallic")  # a suite may have one value of these
+FEWEST_TOLD = 10  # pictures, and more than `MOST` of them: a method may be exact on the balls of a suite
 FEWEST = 4  # objects whose pictures say something: of fewer it may be chance
 
 
@@ -54,16 +56,27 @@ def mistakes_said(records: Sequence[Record]) -> str:
 
 def truth_said(records: Sequence[Record]) -> str:
     """The sentence on maps that no picture tells so well; empty where they are too few to be noted."""
-    found = []
-    strangers = [
-        record for record in records if any(".if_" in key for key in record.values)
-    ]  # Mitsuba's maps have none
+    found = [f"{name} ({true} of {asked} pictures)" for name, true, asked in _true_maps(records)]
+    return f"its answers are the truth but for rounding: {', '.join(found)} (was it told?)" if found else ""
+
+
+def is_truth(records: Sequence[Record]) -> bool:
+    """Whether so many of a method's maps, or lights, are the truth that it stands in no rank."""
+    return any(
+        asked >= FEWEST_TOLD and true > MOST * asked
+        for name, true, asked in _true_maps(records)
+        if name not in NOT_TOLD
+    )
+
+
+def _true_maps(records: Sequence[Record]) -> Iterator[tuple[str, int, int]]:
+    """Quantities of which enough answers to be noted are the truth, and how many of how many."""
+    strangers = [r for r in records if any(".if_" in key for key in r.values)]  # Mitsuba's maps have none
     for name, key, is_true, least in TRUE:
         asked = [record for record in strangers if key in record.values]
         true = [r.object for r in asked if is_true(r.values[key]) and not (name == "light" and _has_other_direction(r))]
         if len(set(true)) >= FEWEST and len(true) > least * len(asked):
-            found.append(f"{name} ({len(true)} of {len(asked)} pictures)")
-    return f"its answers are the truth but for rounding: {', '.join(found)} (was it told?)" if found else ""
+            yield name, len(true), len(asked)
 
 
 def _has_other_direction(record: Record) -> bool:

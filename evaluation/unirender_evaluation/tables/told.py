@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from unirender_evaluation.ceiling import margins_of
 from unirender_evaluation.metrics import Variant
 from unirender_evaluation.records import Record
-from unirender_evaluation.tables.mistakes import truth_said
+from unirender_evaluation.tables.mistakes import is_truth
 from unirender_evaluation.tables.specs import TableSpec
 
 
@@ -14,12 +14,12 @@ def told_the_truth(spec: TableSpec, chosen: Sequence[Record], variant: Variant) 
 
     Args:
         spec: of the table.
-        chosen: its records, one `Selection`.
+        chosen: records of strangers and of the ceiling, one `Selection`.
         variant: how its numbers are taken.
     """
     by_method: dict[str, list[Record]] = {}
     for record in chosen:
         by_method.setdefault(record.method, []).append(record)
-    exact = {method for method, records in by_method.items() if truth_said(records)}
+    exact = {method for method, records in by_method.items() if is_truth(records)}
     keys = (column.key(variant) for column in spec.columns if column.metric.name == "psnr")
-    return frozenset(exact.union(m.method for key in keys for m in margins_of(chosen, key) if m.low_db > 0))
+    return frozenset(exact.union(m.method for key in keys for m in margins_of(chosen, key) if m.breaks))

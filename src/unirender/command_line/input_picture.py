@@ -71,7 +71,7 @@ def read_input(
         elif opaque and outline_is_background(picture.image_srgb, coverage) > BACKGROUND:
             remarks["outline"] = (
                 "the outline of the mask shows the background, which goes into roughness and albedo: the mask is too "
-                "large, shrink it by a pixel or more"
+                "large, unless the object mirrors the background there; shrink it by a pixel or more"
             )
         picture = dataclasses.replace(picture, mask=coverage)
         if coverage.min() >= OPAQUE:

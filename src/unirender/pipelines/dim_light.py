@@ -5,7 +5,8 @@ the dimmest that was, and the picture dark again:
 
     out = (R(x, k L) + max(C(x, k L) - 1, 0)) / k,    k = dimmest / P_99(Y(d))
 
-R ends at display white; C, the closed form, says what lies above it.
+R ends at display white; C, the closed form, says what lies above it. Over a stop k rises from 1, so that a light that
+fades does not flicker.
 """
 
 import numpy as np
@@ -16,7 +17,9 @@ from unirender.intrinsics import Intrinsics
 from unirender.light.exposure import MASK_THRESHOLD, TARGET_RANGE
 
 DIMMEST = TARGET_RANGE[0]  # radiance of a bright white surface
-DIM = DIMMEST / 4  # below which light is brought there: two stops
+DIM = DIMMEST / 4  # below which light is made brighter: two stops; a stop further down it is brought there whole
+MOST = 1024.0  # of k: of what is darker nothing is seen in 8 bits
+LIGHT = ("specular", "diffuse", "environment")
 PERCENTILE = 99.0  # of the object, so that a lamp on a small part of it is not dim
 
 
@@ -32,19 +35,17 @@ def gain_of_dim(intrinsics: Intrinsics) -> float:
     if not inside.any():
         return 1.0
     level = float(np.percentile(luminance(intrinsics.diffuse[inside]), PERCENTILE))
-    return DIMMEST / level if 0 < level < DIM else 1.0
+    if not 0 < level < DIM:
+        return 1.0
+    return float(min((DIMMEST / level) ** min(np.log2(DIM / level), 1.0), MOST))
 
 
-def brightened(intrinsics: Intrinsics) -> tuple[Intrinsics, float]:
-    """The intrinsics under k times their light (s, d and the environment, those that are known), and k.
-
-    Args:
-        intrinsics: with a mask.
-    """
-    if (gain := gain_of_dim(intrinsics)) == 1:
-        return intrinsics, gain
-    light = {name: intrinsics.maps.get(name) for name in ("specular", "diffuse", "environment")}
-    return intrinsics.replace(**{n: v * np.float32(gain) for n, v in light.items() if v is not None}), gain
+def brightened(intrinsics: Intrinsics, gain: float) -> Intrinsics:
+    """The intrinsics under k times their light: s, d and the environment, those that are known."""
+    if gain == 1:
+        return intrinsics
+    light = {name: intrinsics.maps.get(name) for name in LIGHT}
+    return intrinsics.replace(**{n: v * np.float32(gain) for n, v in light.items() if v is not None})
 
 
 def darkened(

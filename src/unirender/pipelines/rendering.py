@@ -11,7 +11,7 @@ from unirender.color import image_srgb as encode_srgb
 from unirender.color import srgb_decode
 from unirender.intrinsics import Intrinsics
 from unirender.models.priors import PRIORS, Prior
-from unirender.pipelines.dim_light import brightened, darkened
+from unirender.pipelines.dim_light import brightened, darkened, gain_of_dim
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.masked_maps import divide
 from unirender.pipelines.network import Network, Overflow
@@ -47,14 +47,16 @@ def render_any_size(
             surfaces cast, and what they reflect.
     """
     without_shadows = [told_derived(to_derive(scene), shadows).union(derived) for scene in scenes]
-    ready = deque(brightened(ready_to_render(scene, shadows)) for scene in scenes)
+    ready = deque(ready_to_render(scene, shadows) for scene in scenes)
     del scenes
-    entered = [enter(network, scene) for scene, _ in ready]
+    entered = [enter(network, scene) for scene in ready]
     for _, small in entered:
         watch(network.overflow(small))
-    rendered = network.images([small for _, small in entered], how, without_shadows)
-    for (frame, small), image in zip(entered, rendered, strict=True):
-        scene, gain = ready.popleft()
+    gains = [gain_of_dim(small) for _, small in entered]
+    bright = [brightened(small, gain) for (_, small), gain in zip(entered, gains, strict=True)]
+    rendered = network.images(bright, how, without_shadows)
+    for (frame, _), small, gain, image in zip(entered, bright, gains, rendered, strict=True):
+        scene = brightened(ready.popleft(), gain)
         left = _leave(network, scene, frame, small, image)
         if gain != 1:
             closed_form = _prior(network).image(scene) if _has_closed_form(scene) else None

@@ -21,7 +21,7 @@ from unirender.intrinsics import Intrinsics
 from unirender.pipelines.framing import Frame
 from unirender.pipelines.masked_maps import unit_normal
 
-TILED = ("albedo", "normal")  # not s and d: a crop shows too little of what is lit to say how (docs/model.md)
+TILED = ("albedo", "normal")  # not s and d: a crop shows too little of what is lit to say how (docs/pipeline.md)
 TILES_AT_ONCE = 16
 
 # premultiplied linear crops [t t 3], their masks [t t 1] and cameras -> for each crop the maps of each sample

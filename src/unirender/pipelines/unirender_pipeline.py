@@ -32,7 +32,6 @@ from unirender.intrinsics import Intrinsics
 from unirender.picture_files.mask_rim import MIXED, mixture_explains
 from unirender.pipelines.carried_light import with_carried_light
 from unirender.pipelines.decomposing import View, decompose_views
-from unirender.pipelines.dim_light import brightened
 from unirender.pipelines.dual_stream_pipeline import DualStreamPipeline
 from unirender.pipelines.editing import anchor, check_exposure, specular_for_roughness, too_coarse, under_light
 from unirender.pipelines.framing import thumbnail
@@ -288,8 +287,7 @@ class UniRenderPipeline(DualStreamPipeline):
         """
         check_rendered(intrinsics, ())
         network = self._network()
-        maps, _ = brightened(ready_to_render(intrinsics))
-        return network.overflow(enter(network, maps)[1])
+        return network.overflow(enter(network, ready_to_render(intrinsics))[1])
 
     def edit(
         self,

@@ -47,7 +47,7 @@ def check_masks(views: Views, cells: int) -> None:
         _log.warning("%d pictures and no mesh: the shape will be rough, expected %d or more", len(masks), FEW_VIEWS)
     if shifted := shifted_principal(views.seen):
         _log.warning(
-            "the masks agree better with %s moved by about %+.0f pixels: is the principal point right?", *shifted
+            "the masks agree better with cx moved by about %+.0f pixels: is the principal point right?", shifted
         )
 
 
