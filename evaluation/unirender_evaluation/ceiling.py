@@ -89,7 +89,7 @@ def ceiling_lines(records: Sequence[Record]) -> list[str]:
     lines = list(breaches)
     if told:
         other = "other " if breaches else ""
-        within = f"no {other}measured row exceeds the noise ceiling by more than its interval"
+        within = f"no {other}measured row exceeds the noise ceiling by half a dB beyond its interval"
         lines.append(f"  HOLDS  {within} ({', '.join(told)})")
     if untold:
         nothing = f"nothing is told of fewer than {FEWEST} objects"

@@ -247,7 +247,7 @@ def _plugin(
         raise UnirenderError(f"{what}: {error}") from None
     if source != _READ.setdefault((module.__name__, name, type(method).__module__, type(method).__qualname__), source):
         raise UnirenderError(
-            f"{what}: its files were edited after this process had imported them, and it would run as it was; start "
+            f"{what}: its files were edited after this process had imported them, and it may run as it was; start "
             "Python anew (in a notebook: restart the kernel)"
         )
     for beside, other in shadowed(type(method), found, module):
