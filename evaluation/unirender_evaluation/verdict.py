@@ -161,7 +161,7 @@ HEAD = (
 
 
 def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, lights: Lights | None = None) -> str:
-    """The verdict section: claims, those that fail first, ceiling, truth check; one line each.
+    """The verdict section: claims, those that fail first, then checks: ceiling and truth; one line each, counted apart.
 
     Args:
         records: of the run.
@@ -174,11 +174,12 @@ def verdict_text(records: Sequence[Record], run: RunInfo, check: dict | None, li
     lines += [f"  {line}" for line in _counts_line(found)]
     lines += [f"  {finding}" for finding in sorted(found, key=_place)]
     lines += [f"  ({line})" for line in summary(found)]
-    lines += [f"  FAILS  {method}: {said}" for method, said in _told(records)]
-    lines += ceiling_lines(records)
     told = "what its check found stands in the run's verdict.txt"
     unknown = f"not rendered again ({run.unchecked})" if run.unchecked else told
-    lines += _truth_lines(check) if check else [f"  open   truth: {unknown}"]
+    checks = [f"  FAILS  {method}: {said}" for method, said in _told(records)]
+    checks += ceiling_lines(records)
+    checks += _truth_lines(check) if check else [f"  open   truth: {unknown}"]
+    lines += [_checks_line(checks), *checks]
     if run.limit is not None:
         lines.append(f"  (--limit {run.limit}: a partial run, not a result)")
     return "\n".join(lines)
@@ -198,10 +199,16 @@ def _place(finding: Finding) -> int:
 
 
 def _counts_line(found: Sequence[Finding]) -> list[str]:
-    """How many lines begin with each word; nothing where there is none."""
+    """How many claims begin with each word; nothing where there is none."""
     words = Counter(finding.word for finding in found if finding.comparison is not None)
     counted = [*(f"{word} {words[word]}" for word in ORDER), f"not compared {len(found) - words.total()}"]
-    return [f"({', '.join(counted)})"] if found else []
+    return [f"(claims: {', '.join(counted)})"] if found else []
+
+
+def _checks_line(checks: Sequence[str]) -> str:
+    """How many lines of the checks begin with each word."""
+    words = Counter(line.split()[0] for line in checks)
+    return f"  (checks: {', '.join(f'{word} {words[word]}' for word in ORDER[:3])})"
 
 
 def judged(records: Sequence[Record], run: RunInfo, lights: Lights | None) -> list[Finding]:

@@ -13,6 +13,7 @@ from unirender.errors import UnirenderError
 from unirender_evaluation.comparisons import over_lights
 from unirender_evaluation.metrics import DEFAULT_VARIANT, METRICS
 from unirender_evaluation.records import Record
+from unirender_evaluation.results.commands import rows_of
 from unirender_evaluation.results.compare import Rank, chosen_pairs, compare_pair, rank
 from unirender_evaluation.results.listing import LISTINGS, METHOD_GROUPS
 from unirender_evaluation.runs.config import GROUPS
@@ -121,6 +122,25 @@ def test_a_table_may_have_some_rows_and_columns_alone(bench, files: tuple[Path, 
     status, out, err = bench(*asked, "--table", "inverse", "--method", "input-as-albedo", "--metric", "cosine")
     assert (status, out) == (1, "")  # the row is in the table, but has no value in the columns that are left
     assert "no values of inverse, input-as-albedo, cosine" in err
+
+
+def test_a_row_that_two_files_do_not_agree_on_is_chosen_of_both_or_of_one(bench, files: tuple[Path, Path]) -> None:
+    asked = ("tables", *files, "--variant", "masked-srgb-raw", "--table", "inverse", "--format", "json")
+    for name, labels in (
+        ("ours-mean", ["Ours (mean) (a)", "Ours (mean) (b)"]),
+        ("ours-mean-from-b", ["Ours (mean) (b)"]),
+        ("input-as-albedo", ["input as albedo"]),
+    ):
+        (made,) = json.loads(bench(*asked, "--method", name)[1])
+        assert [row["label"] for row in made["rows"]] == labels
+
+
+def test_a_row_whose_own_name_reads_like_a_merged_one_is_not_chosen_with_another() -> None:
+    run = small_results().run
+    keys = ("mine", "mine-from-scratch", "mine-from-b")
+    run = replace(run, methods=tuple(replace(run.methods[0], key=key) for key in keys))
+    kept, _ = rows_of(run, [], ["mine"], {"mine", "mine-from-scratch"})
+    assert [info.key for info in kept.methods] == ["mine", "mine-from-b"]
 
 
 def test_intervals_of_tables_may_be_over_lights_too(bench, files: tuple[Path, Path]) -> None:

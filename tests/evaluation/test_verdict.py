@@ -89,6 +89,26 @@ def test_deliberate_errors_that_were_missed_are_named() -> None:
     assert "roughness" not in text
 
 
+def test_every_line_of_the_verdict_is_counted_with_the_claims_or_with_the_checks() -> None:
+    level = np.linspace(15, 20, 12)
+    records = [
+        *rows("theirs", ALBEDO, level + 30),
+        *rows("input-as-albedo", ALBEDO, level),
+        *rows("noise-ceiling", ALBEDO, level + 25),
+    ]
+    run = run_of(theirs="external", **{"input-as-albedo": "trivial", "noise-ceiling": "ceiling"})
+    failed = CHECK | {"passed": False, "failed": ["x: z-test FAILED"]}
+    _, *lines = verdict_text(records, run, failed).splitlines()
+    head = next(line for line in lines if line.startswith("  (checks: "))
+    claims, checks = lines[: lines.index(head)], lines[lines.index(head) :]
+    assert checks[0] == "  (checks: FAILS 2, open 0, HOLDS 1)"
+    for counts, *told in (claims, checks):
+        for word in ("FAILS", "open", "HOLDS"):
+            assert f" {word} {sum(line.startswith(f'  {word} ') for line in told)}" in counts
+    assert any(line.startswith("  FAILS  truth: ") for line in checks)
+    assert any(line.startswith("  FAILS  theirs exceeds the noise ceiling ") for line in checks)
+
+
 def test_a_strangers_row_has_claims_of_its_own() -> None:
     """Against every trivial row on the tables that it has answers for, and against the ceiling; ours are not missed."""
     rng = np.random.default_rng(1)
@@ -114,7 +134,7 @@ def test_a_strangers_row_has_claims_of_its_own() -> None:
     assert not {"metallic", "normal", "edit_metallic"} & {quantity for quantity, _ in found}
     text = verdict_text(records, run, CHECK)
     counts, *lines = text.splitlines()[1:]
-    assert counts == "  (FAILS 1, open 0, HOLDS 1, stated 1, not compared 1)"
+    assert counts == "  (claims: FAILS 1, open 0, HOLDS 1, stated 1, not compared 1)"
     words = ["FAILS", "HOLDS", "stated"]
     assert [line.split()[0] for line in lines[:3]] == words, "those that fail first"
     assert "HOLDS  inverse/single-image albedo PSNR: theirs beats input-as-albedo" in text

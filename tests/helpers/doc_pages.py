@@ -152,6 +152,8 @@ def stranger() -> Names:
 
 def check_predictions(names: Names) -> None:
     suite = make_suite(Path("again"))
+    asked = {path.parent.name for path in Path("inputs").glob("*/meta.json") if '"intrinsics": {' in path.read_text()}
+    assert {path.parent.name for path in Path("predictions").glob("*/*")} == asked, "maps where maps are asked for"
     assert not folder_problems(PredictionFolder(Path("predictions")), questions(suite), "ball")
     rows = {row.pop("method"): row for row in names["rows"]}
     own, folder = rows["retinex"]["albedo.psnr@masked-srgb-raw"], rows["mine"]["albedo.psnr@masked-srgb-raw"]

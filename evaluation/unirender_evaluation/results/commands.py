@@ -3,7 +3,7 @@
 Light to import; each command loads what it needs when it runs. None of them measures anything.
 """
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -68,7 +68,8 @@ class BenchTables:
     table: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Print only this table (rendering, inverse, relighting, light, multi-view, physics); repeatable. None: all."""
     method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Key of a row; only these are printed, and ranked among themselves. Repeatable."""
+    """Key of a row, as one of the files has it or as the merged table; only these are printed, and ranked among
+    themselves. Repeatable."""
     metric: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Only columns of this metric (psnr, lpips_vgg, mse ...), for a table that fits a page; repeatable."""
     variant: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -91,7 +92,7 @@ class BenchTables:
         variants = asked_variants(self.variant)
         found = [read_results(path) for path in self.files]
         run, records = merge(found)
-        run, records = rows_of(run, records, self.method)
+        run, records = rows_of(run, records, self.method, {info.key for file in found for info in file.run.methods})
         lights = lights_of(found) if self.interval == "objects-and-lights" else None
         tables = [table for table in build_tables(records, run, specs, variants, lights) if table.rows]
         if not tables:
@@ -103,8 +104,16 @@ class BenchTables:
         return 0
 
 
-def rows_of(run: "RunInfo", records: "Sequence[Record]", methods: Sequence[str]) -> "tuple[RunInfo, Sequence[Record]]":
+def rows_of(
+    run: "RunInfo", records: "Sequence[Record]", methods: Sequence[str], unmerged: Set[str]
+) -> "tuple[RunInfo, Sequence[Record]]":
     """Run and records of these rows; without names, of all.
+
+    Args:
+        run: of all files.
+        records: of all files.
+        methods: the names; one that a file has stands for its rows of every file.
+        unmerged: the keys that the files have themselves.
 
     Raises:
         UsageError: there is no such row.
@@ -115,8 +124,10 @@ def rows_of(run: "RunInfo", records: "Sequence[Record]", methods: Sequence[str])
             raise UsageError(f"--method {name}: no such row{instead(name, keys)}")
     if not methods:
         return run, records
-    kept = tuple(info for info in run.methods if info.key in methods)
-    return replace(run, methods=kept), [record for record in records if record.method in methods]
+    twins = tuple(f"{name}-from-" for name in methods)  # as `merge` calls the rows of further files
+    kept = {key for key in keys if key in methods or (key not in unmerged and key.startswith(twins))}
+    infos = tuple(info for info in run.methods if info.key in kept)
+    return replace(run, methods=infos), [record for record in records if record.method in kept]
 
 
 def asked_specs(tables: Sequence[str], metrics: Sequence[str]) -> "dict[str, TableSpec]":
