@@ -78,10 +78,11 @@ class BenchExport:
         from unirender_evaluation.suites.suite import load_suite
 
         with new_folder(self.out) as folder:
-            count = export_inputs(load_suite(self.suite), folder, self.limit)
+            kinds = export_inputs(load_suite(self.suite), folder, self.limit)
+        asked = ", ".join(f"{kind} {count}" for kind, count in kinds.items())
         limit = "" if self.limit is None else f" --limit {self.limit}"
-        scores = f"`unirender bench run --suite {self.suite}{limit} --predictions NAME=FOLDER` scores the answers"
-        print(f"{count} questions about the pictures in {self.out}; {scores}")
+        scores = f"`unirender bench run --suite {self.suite}{limit} --methods plugins --predictions NAME=FOLDER`"
+        print(f"{kinds.total()} questions about the pictures in {self.out} ({asked}); {scores} scores the answers")
         return 0
 
 

@@ -14,6 +14,7 @@ neither names nor times say which object or material a picture is of.
 """
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +27,14 @@ from unirender_evaluation.task import PROTOCOLS, Task
 from unirender_evaluation.tasks import scene_ids, tasks
 
 
-def export_inputs(suite: Suite, out: Path, limit: int | None = None) -> int:
-    """Writes the inputs of all protocols (see the module); returns the number of questions."""
+def export_inputs(suite: Suite, out: Path, limit: int | None = None) -> Counter[str]:
+    """Writes the inputs of all protocols (see the module); returns how many questions there are of each kind of answer:
+    intrinsics, environment, edit, relight, render."""
     asked: dict[str, list[Task]] = {}
     for table, protocol in PROTOCOLS:
         for task in tasks(suite, table, protocol, scene_ids(suite, limit)):
             asked.setdefault(task.folder, []).append(task)
-    count = sum(map(len, asked.values()))
+    kinds = Counter(task.answer.partition("_")[0] for own in asked.values() for task in own)
     for name in sorted(asked):
         folder = out / name
         folder.mkdir(parents=True)
@@ -43,7 +45,7 @@ def export_inputs(suite: Suite, out: Path, limit: int | None = None) -> int:
             "answers": {task.answer: _write_question(task, folder) for task in asked.pop(name)},
         }
         (folder / "meta.json").write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
-    return count
+    return kinds
 
 
 def _write_question(task: Task, folder: Path) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from tiny_suites import write_suite
 from unirender.cli import main
 from unirender.errors import UnirenderError
 from unirender.models.precision import resolve_device
+from unirender_evaluation.commands import BenchExport
 from unirender_evaluation.metrics import chosen_variants
 from unirender_evaluation.records import Record
 from unirender_evaluation.runs.benchmark import run
@@ -198,6 +199,19 @@ def test_repeated_options_add_up(tmp_path: Path) -> None:
     words = ["--predictions", "a=x", "--method", "m:A", "--predictions", "b=y", "--method", "m:B"]
     command = tyro.cli(BenchRun, args=words)
     assert (command.predictions, command.method) == (("a=x", "b=y"), ("m:A", "m:B"))
+
+
+def test_export_says_what_is_asked_and_the_command_that_scores_the_answers_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    suite, out = write_suite(tmp_path / "suite"), tmp_path / "inputs"
+    BenchExport(out, str(suite), limit=1).run()
+    said = capsys.readouterr().out
+    asked = "edit 3, relight 2, environment 1, render 6, intrinsics 2"
+    assert said.startswith(f"14 questions about the pictures in {out} ({asked}); `unirender bench run ")
+    command = tyro.cli(BenchRun, args=said.split("`")[1].split()[3:])
+    expected = BenchRun(suite=str(suite), limit=1, methods=("plugins",), predictions=("NAME=FOLDER",))
+    assert command == expected
 
 
 @pytest.mark.parametrize(

@@ -491,8 +491,10 @@ def test_folder_and_plugin_score_alike(suite: Suite, tmp_path: Path) -> None:
 
 
 def test_export_writes_inputs_and_no_truth(suite: Suite, tmp_path: Path) -> None:
-    count = export_inputs(suite, tmp_path / "out")
-    assert count == sum(1 for t, p in PROTOCOLS for _ in tasks(suite, t, p, list(suite.scenes)))
+    kinds = export_inputs(suite, tmp_path / "out")
+    assert kinds.total() == sum(1 for t, p in PROTOCOLS for _ in tasks(suite, t, p, list(suite.scenes)))
+    assert kinds.keys() == {"intrinsics", "environment", "edit", "relight", "render"}
+    assert kinds["intrinsics"] == sum(1 for _ in tasks(suite, "inverse", "single-image", list(suite.scenes)))
     names = {path.name for path in (tmp_path / "out").rglob("*") if path.is_file()}
     assert names == {"image.png", "mask.exr", "meta.json", "given.exr", "environment.exr"}
     for meta in (tmp_path / "out").glob("*/meta.json"):
